@@ -44,17 +44,6 @@ def test_effects_of_the_table_are_named_and_nothing_else():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ('name', 'called'),
-    [('coil_steps', 'coil_fluctuation'), ('channels_swapped', 'swapped_channels')],
-)
-def test_an_effect_of_no_table_gets_a_name_of_its_own(name, called):
-    result, _ = found(name, 4)
-    assert [f.record.name for f in result.findings] == [called]
-    assert result.flux_rms_after_t < 1.1 * result.flux_rms_floor_t
-
-
-@pytest.mark.long
 @pytest.mark.parametrize('name', ['quantised', 'channel_lag'])
 def test_what_nothing_describes_stays_unexplained(name):
     result, _ = found(name, 5, emitters=4)
@@ -76,6 +65,52 @@ def test_what_drifts_is_named_with_its_size():
         [record] = [f.record for f in diagnose(made.problem(), made.model).findings]
         assert (record.name, record.parameters.get('coil')) == (name, term.site.get('coil'))
         assert record.parameters[effect.size] == pytest.approx(amount, rel=0.05)
+
+
+def changed(factors: np.ndarray, **spread: float) -> dict:
+    """Records of a tool whose emitters are multiplied by factors (F or 1, K), by their labels."""
+    made = world(3, 375, 3)
+    made.tool = replace(made.tool, flux=made.tool.flux * factors[:, None])
+    problem = replace(made.problem(), references=None)
+    problem = replace(problem, spread=replace(problem.spread, **spread))
+    found = diagnose(problem, made.model).findings
+    return {f.term.label if f.term else f.record.name: f.record.parameters for f in found}
+
+
+def test_phases_of_all_emitters_are_named_one_by_one():
+    phases = [0.004, -0.003, 0.006]
+    named = changed(np.exp(1j * np.array([phases])))
+    assert set(named) == {f'coil_phase (coil {k})' for k in range(3)}
+    found = [named[f'coil_phase (coil {k})']['phase_rad'] for k in range(3)]
+    np.testing.assert_allclose(found, phases, atol=3e-4)
+
+
+def test_a_curve_that_does_not_hold_gives_way_to_a_step():
+    step = np.where(np.arange(375)[:, None] > 150, [[1.006, 1.0, 1.0]], 1.0)
+    assert set(changed(step)) == {'coil_fluctuation (coil 0)'}
+
+
+def test_nothing_is_named_that_the_model_may_be_wrong_by():
+    gain = np.full((1, 3), 1.001)
+    assert set(changed(gain)) == {'common_gain'}
+    assert not changed(gain, flux_t=2e-9)
+
+
+def test_a_moved_emitter_is_one_fault_where_its_gradient_is_hardly_known():
+    rng, made = np.random.default_rng(5), world(5, 375, 4)
+    effect, base = all_effects()['coil_moved'], made.model.dipoles
+    term = effect.candidates(made.problem().apparatus)[1].with_theta([-0.003, 0.0, 0.003])
+    moved = effect.sources(term, base, base, None)
+    wrong = 1 + 0.6 * rng.normal(size=(1, len(made.reference.sensors), 1))
+    for one, factor in (('tool', 1.0), ('reference', wrong)):
+        old = getattr(made, one)
+        at = made.true_pose() if one == 'tool' else (old.position, old.rotation)
+        places, axes = (part.reshape(-1, 3) for part in old.sensors.placed(*at))
+        change = factor * moved.flux(places, axes, None).reshape(old.flux.shape)
+        setattr(made, one, replace(old, flux=old.flux + change))
+    [record] = [f.record for f in diagnose(made.problem(), made.model).findings]
+    assert (record.name, record.parameters['coil']) == ('coil_moved', 1)
+    np.testing.assert_allclose(record.parameters['shift_m'], [-0.003, 0, 0.003], atol=1e-4)
 
 
 @pytest.mark.parametrize('quarter', [0.0, 90.0])

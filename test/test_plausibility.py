@@ -114,6 +114,7 @@ def test_fluxes_in_another_unit(moving, tool, unit):
     larger = replace(tool, flux=FLUX_UNITS[unit] * tool.flux)
     says(moving, larger, f'{unit}?', 'drawn board')
     blind = replace(larger, track=None, has_pose=np.zeros_like(tool.has_pose))
+    says(moving, replace(tool, flux=0.0 * tool.flux), 'all fluxes of all tools are zero')
     if unit == 'millitesla':  # without poses, so much could still be near a coil
         assert checked(moving, blind)[1] == ''
     else:
@@ -164,6 +165,9 @@ def test_a_diagnosis_of_one_pose_ends_at_once(moving, tool):
     )
     with pytest.raises(DiagnosisError, match='optical poses are the same'):
         diagnose_session(replace(moving, tools=(rest,)), load_model(MODEL))
+    large = replace(tool, flux=1e3 * tool.flux)
+    with pytest.raises(DiagnosisError, match=r'1e\+03 times what the model predicts'):
+        diagnose_session(replace(moving, tools=(large,)), load_model(MODEL))
 
 
 def test_commands_say_it_in_one_line(tmp_path, capsys):

@@ -80,6 +80,8 @@ def faults_of(
             {'turn': [0, 0, -90.0], 'coils': [1]},
             {'body_turned': {'rotation_deg': (0.0, 0.0, -90.0)}, 'coil_polarity': {'coils': (1,)}},
         ),
+        # Two reversed coils leave what is not in the middle; a half turn leaves nothing.
+        ({'turn': [180.0, 0, 0]}, {'body_turned': {'rotation_deg': (180.0, 0.0, 0.0)}}),
         (
             {'sensors': range(6), 'turn': [0, 180.0, 0]},
             {'body_turned': {'rotation_deg': (0.0, 180.0, 0.0)}},

@@ -412,7 +412,9 @@ def _checked_open(problem: Problem, fit: Fit, term: Term, noise: float) -> Confi
         raw = term.effect.directions(term, part.view)
         columns.append(None if raw is None else parts(raw) * part.whitener.weight[..., None])
     stays = _stays(fit.state, columns, noise, noise) / power
-    return Confirmation(power, 0.0, np.inf, stays, alike=_crowd(fit, term))
+    return Confirmation(
+        power, 0.0, np.inf, stays, inexact=term.effect.inexact, alike=_crowd(fit, term)
+    )
 
 
 def doubtful(problem: Problem, fit: Fit) -> list[tuple[Confirmation, Term]]:

@@ -13,9 +13,7 @@ Gains are judged in units of the *misfit*, the mean square of the remaining resi
 unexplained residuals a gain must be larger in proportion to be significant.
 
 An effect declares the cost of its parameters (`Effect.complexity`), and the share of its power
-that its model may miss (`Effect.inexact`). Schwarz's penalty as the price of a fluctuation, and
-the spread by noise for `as_good`, named the few cases that were tried the same way and none better
-(`docs/log.md`).
+that its model may miss (`Effect.inexact`).
 
 Unless a number says otherwise, it was chosen by hand on injected effects with seeds below 100
 (`test/injection.py`); cases of later seeds that led to a rule are named in `docs/log.md`.
@@ -58,9 +56,8 @@ pose to pose, so only a glitch stands out so far. Smaller takes jitter for glitc
 glitches in the fit."""
 PLACE_RATIO = 40.0
 """The same for readings and frames of a body that rested at each place for seconds: its neighbours
-in time are centimetres away, and what the field's model misses differs between them. Over the
-middle of a simulated board single readings of an older model had 6 to 18; a contact that fails
-has thousands. Smaller takes a model's errors for loose contacts."""
+in time are centimetres away, and what the field's model misses differs between them, by up to 18
+(a contact that fails has thousands). Smaller takes a model's errors for loose contacts."""
 WHOLE_FRAME_SHARE = 0.5
 """Share of a frame's readings, and of frames that lost any, from which whole frames are out: more
 bad than good, so that what is left of the frame is not to be believed either."""
@@ -89,23 +86,19 @@ LEAST_GAIN_SHARE_BESIDE_METAL = 0.01
 LEAST_OF_EXCESS = 0.4
 """Share of what is left to explain that an explanation with freedom in time (a fluctuation, or
 metal at another place in each block) must explain: less than that is another effect's trace along
-its columns. On unused seeds (`docs/log.md`) twice as much called a low pass a gain, half changed
-no name, and the marginal likelihood alone gave one wrong name less. It was not put in its place,
-as on metal that moves it fits fluctuations that are all refused, for two thirds more time."""
+its columns. Twice as much called a low pass a gain (`docs/log.md`)."""
 LEAST_OF_NOISE = 0.05
 """Share of the noise's power that a fluctuation must explain: a field model's own error is alike
-in neighbouring frames and channels, and any freedom takes some of it. On unused seeds
-(`docs/log.md`) twice as much changed no name, and without it three small effects that are missed
-got their names; but a clean session, with a model from a scan in which all was a little wrong, got
-a loose axis that explains 0.015."""
+in neighbouring frames and channels, and any freedom takes some of it. Without it a clean session
+got a loose axis that explains 0.015 (`docs/log.md`)."""
 REMNANT = 0.01
 """Further metal with less than this share of the strongest metal's gain is what the model of that
 one left."""
 OWN_METAL = 2.0
-"""Gain of metal at rest, over the power that the model states of its own error in all readings,
-below which the metal may be the model's: what was taken off a scan with metal near leaves a field
-that is metal's, by 2.3 of its stated sigmas in `dirty/scan_metal`, the only such scan that was
-tried. Larger hides faint metal (2.0: what moves a tool by 0.03 mm); smaller names what is none."""
+"""Gain of metal at rest, over the power that the model states of its own error in all readings
+(of any other effect 1), below which it may be the model's: what was taken off a scan with metal
+near leaves a field that is metal's, by 2.3 of its stated sigmas in `dirty/scan_metal`, the only
+one tried. Larger hides faint metal (2.0: what moves a tool by 0.03 mm)."""
 COMPLETE = 3.0
 """Misfit up to which parts that were set up anew explain a session, so that they are its rival to
 metal at rest. They have so many parameters that beside another effect they take off much of what
@@ -143,9 +136,7 @@ parameter that it spares. Together they are less than what a further effect with
 must gain (`LEAST_GAIN`, `PER_PARAMETER`), so what is given up would not have been accepted."""
 ALIKE = 0.02
 """Share of a gain by which two explanations may differ that the data do not distinguish: metal of
-an unknown shape leaves about as much. Within it a rival is listed, and metal rests. Half, twice as
-much, and Laplace's evidence of both explanations in its place, changed no name, but the two runs
-that asked were far from it (`docs/log.md`)."""
+an unknown shape leaves about as much. Within it a rival is listed, and metal rests."""
 STEADY = 0.8
 """Share of a fluctuation's gain from which a constant, or a curve, of the same coil or channel is
 tried first: freedom in every frame also takes off what is another effect's."""
@@ -178,8 +169,7 @@ moving metal be named without asking whether rest and one more effect would do."
 LIMITS_LEFT, REST_LEFT = 2.0, 0.5
 """What the linear score of an effect beside metal at rest may leave for it to be fitted: so many
 times what the two must come down to, and such a share (0 to 1) of what metal at rest leaves alone.
-Smaller passes over effects whose fit explains more than their score; larger spends fits in
-vain."""
+Smaller passes over effects whose fit explains more than their score."""
 MOST_EFFECTS_AT_REST = 3
 """Effects that are tried together with metal at rest before metal counts as moving. Fewer let
 metal move for what rest and one more effect explain; each further one costs a full fit."""
@@ -199,9 +189,8 @@ LEAST_OF_THE_REST = 0.2
 larger is unknown, and the effect is probably its trace."""
 LEAST_POWER_SIGMAS = 6.0
 """Standard deviations of the noise's power from which a remainder counts. A normal variable passes
-it once in 1e9, the power of normal noise in one cell of 400 frames once in 5e7. Where the median
-cell is taken its spread is a quarter larger, and a normal variable passes once in 1e6. Noise that
-depends on its neighbours passes oftener. One test per effect is made."""
+it once in 1e9, the power of normal noise in one cell of 400 frames once in 5e7. Noise that depends
+on its neighbours passes oftener. One test per effect is made."""
 MODEL_ERROR = 1.3
 """Variance over the noise's up to which a field model may be wrong, whatever it says: of a board
 beyond what was scanned. It is not held against an effect on everything."""
@@ -214,19 +203,16 @@ reads of one emitter): taking the pose out spreads a trace of each change over a
 # --- whether what stays is noise ---------------------------------------------------------------
 LEAST_NOISE_GROWTH = 1.15
 """Factor from which noise counts as grown. A channel's spread over 400 frames of eight emitters is
-known to 1 %, so it is no chance; how much is worth a name was chosen, as the rest, by hand."""
+known to 1 %, so it is no chance."""
 FEWEST_OUTLIERS = 0.004
-"""Share of frames from which outliers are named. Normal noise makes none in a session: a reading
-of 16 values passes its limit once in 5e12, one of 8 values once in 1e7."""
+"""Share of frames from which outliers are named. Normal noise makes none in a session."""
 KNOWN_SIGMAS = 3.0
 """Standard deviations by which a share of frames may exceed the one that the model knows of, which
 chance alone does in one session of 700."""
 MOST_EXCESS_OF_OUTLIERS = 0.3
 """Unexplained power over the floor's up to which frames that stand out are outliers: a model that
-is wrong by more makes some itself. Larger names outliers that are another effect's; smaller leaves
-true ones unnamed if there is a small unknown. On unused seeds (`docs/log.md`) half and twice as
-much changed no name. With no bound the outliers of six runs would be named that are not now, and a
-hum would be called outliers, of which there are none."""
+is wrong by more makes some itself. Larger names outliers that are another effect's, and with no
+bound a hum; smaller leaves true ones unnamed if there is a small unknown (`docs/log.md`)."""
 
 # Each of the next four lies above all that normal noise reached in 200 draws of 100 frames with 48
 # readings, the fewest of a watch on two clusters and four coils; more frames or readings reach

@@ -23,7 +23,7 @@ from anser_ros.diagnosis.problem import (
     train_blocks,
 )
 from anser_ros.diagnosis.search import Progress, Search, SearchSettings, search_effects
-from anser_ros.diagnosis.wiring import wiring_faults
+from anser_ros.diagnosis.wiring import check_size, wiring_faults
 from anser_ros.effects.correction import Fields, changed_illumination
 from anser_ros.effects.effect import Family, Remedy, Term
 from anser_ros.effects.seen import EXCESS_NOISE, known_share, outliers_of
@@ -139,15 +139,11 @@ def corrected_model(
         for mode, own in zip(wide, modes, strict=True):
             np.add.at(mode, rows[: model.positions.shape[0]], own)
         modes = wide
+    # References were read in the field without these.
     return replace(
-        model,
-        positions=merged.positions,
-        directions=merged.directions,
-        moments=merged.moments,
-        modes=modes,
-        effects=(*model.effects, *records),
-        references=None,  # they were read in the field without these
-    )
+        model, positions=merged.positions, directions=merged.directions, moments=merged.moments,
+        modes=modes, effects=(*model.effects, *records), references=None,
+    )  # fmt: skip
 
 
 def _merged(dipoles: Dipoles) -> tuple[Dipoles, Integers]:
@@ -233,7 +229,9 @@ def diagnose(
 
 def screen(problem: Problem) -> Screened:
     """Name the faults of the wiring, and leave out dead channels and values that stand out."""
-    known = wiring_faults(problem.thinned(WIRING_FRAMES))
+    few = problem.thinned(WIRING_FRAMES)
+    check_size(few)
+    known = wiring_faults(few)
     whole = _without_dead(problem, known)
     return Screened(tuple(known), whole, whole if known else screening.clean_start(whole))
 
@@ -284,6 +282,8 @@ def _settled(
         refused += [(term, check) for check, term in dropped]
         gone = [term for _, term in dropped]
         rest = [t for t in fit.terms if not any(t is term or t.belongs_to(term) for term in gone)]
+        # No curve, no constant: what it went before has a chance, once.
+        rest += [p for t in gone if (p := search.passed.pop(t.label, None)) is not None]
         fit = settled(fitter, refit_spreads(fitter.problem, rest))
     return settled(last, refit_spreads(last.problem, fit.terms), FINE), tuple(refused)
 
@@ -320,18 +320,10 @@ def conclude(
     if excess > decisions.DEPENDENT * floor**2:
         depends = tuple(dict.fromkeys([*(depending if grown else ()), *named]))
     return Diagnosis(
-        findings=tuple(findings),
-        flux_rms_before_t=rms(before),
-        flux_rms_after_t=rms(after),
-        flux_rms_floor_t=floor,
+        findings=tuple(findings), flux_rms_before_t=rms(before), flux_rms_after_t=rms(after),
+        flux_rms_floor_t=floor, depends_on=depends,
         unexplained=excess / possible if significant and possible > 0 else 0.0,
-        depends_on=depends,
-        tests_before=tuple(screening.structure_tests(before)),
-        tests_after=tests,
-        model=corrected_model(model, fit.terms, records, cleaned.fields),
-        search=search,
-        refused=confirmed.refused,
-        before=before,
-        after=after,
-        terms=fit.terms,
-    )
+        tests_before=tuple(screening.structure_tests(before)), tests_after=tests,
+        model=corrected_model(model, fit.terms, records, cleaned.fields), search=search,
+        refused=confirmed.refused, before=before, after=after, terms=fit.terms,
+    )  # fmt: skip

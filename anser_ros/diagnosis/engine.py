@@ -49,6 +49,11 @@ class BlockSums:
         """Return the number of columns."""
         return int(self.right.shape[1])
 
+    @property
+    def is_finite(self) -> bool:
+        """Return whether all columns are numbers."""
+        return bool(np.isfinite(self.normal).all())
+
     def part(self, rows: Integers) -> 'BlockSums':
         """Return the sums of some blocks, chosen by index."""
         return BlockSums(self.normal[rows], self.right[rows], self.squares[rows])
@@ -315,7 +320,12 @@ class JointFit(Generic[StateT]):
         return self.covariance[self.rows(index), self.rows(index)]
 
     def held_out(self) -> float:
-        """Return the cross-validated squares, linear about the optimum, plus what freedom cost."""
+        """Return the cross-validated squares, linear about the optimum, plus what freedom cost.
+
+        Infinite where there is no derivative, as of metal in an emitter's dipole.
+        """
+        if not self.sums.is_finite:
+            return np.inf
         return self.sums.held_out(self.prior, self.state.folds) + self.state.penalty
 
 
@@ -333,6 +343,8 @@ def descended(
     damping = 0.0
     for _ in range(iterations if state.prior().size else 0):
         sums = state.sums(blocks)
+        if not sums.is_finite:
+            return state, blocks, sums
         better, damping = _better(state, sums, state.prior(), damping)
         if better is None:
             return state, blocks, sums

@@ -60,6 +60,7 @@ class Search:
     # explained nearly as much when it was taken.
     rivals: dict[str, list[Candidate]] = field(default_factory=dict)
     close: dict[str, list[Term]] = field(default_factory=dict)
+    passed: dict[str, Term] = field(default_factory=dict)  # the fluctuation that it went before
     metal_gain: float = 0.0  # what the strongest metal took off
 
 
@@ -87,11 +88,11 @@ def is_worthwhile(gain: float, parameters: int, fit: Fit) -> bool:
 
 
 def _may_be_the_model_s(gain: float, fit: Fit) -> bool:
-    """Whether metal at rest explains no more than what the model may have of its own."""
-    if fit.newest.effect.family is not Family.METAL_AT_REST:
-        return False
+    """Whether an effect explains no more than what the model may have of its own."""
     own = fit.state.problem.spread.model_share * fit.state.count
-    return gain < decisions.OWN_METAL * own * max(fit.misfit, 1.0)
+    if fit.newest.effect.family is Family.METAL_AT_REST:
+        own *= decisions.OWN_METAL * max(fit.misfit, 1.0)
+    return gain < own
 
 
 class _FluxSelection(ForwardSelection[Fit]):
@@ -120,21 +121,25 @@ class _FluxSelection(ForwardSelection[Fit]):
                 search.metal_gain = max(search.metal_gain, metal[0])
                 return shaped
         term = best.newest
-        if not is_worthwhile(gain, term.complexity, best):
+        is_own = _may_be_the_model_s(gain, best)
+        rivalled = term.effect.family.is_metal and fit.misfit > decisions.COMPLETE
+        if not is_worthwhile(gain, term.complexity, best) or (is_own and not rivalled):
             return None
         if term.effect.family.is_metal:
             if gain < decisions.REMNANT * search.metal_gain:
                 return None
-            is_own = _may_be_the_model_s(gain, best)
-            if is_own and fit.misfit < decisions.COMPLETE:
-                return None
+            if term.effect.family is Family.MOVING_METAL:
+                best = choice.moves_or_rests(self._fitter, best, fitted, self._others, gain)
             if is_own or self._is_installed_anew(fit, best, gain):
                 self._most_metals = 0
                 return self._stood_anew(fit, gain) or self.addition(fit)
             search.metal_gain = max(search.metal_gain, gain)
         search.rivals[term.label] = _rivals(gain, best, fitted)
+        first = max(fitted, key=lambda pair: pair[0])[1].newest
+        if first.effect.rivals(first, term):
+            search.passed[term.label] = first
         if term.effect.family is Family.MOVING_METAL:
-            return choice.moves_or_rests(self._fitter, best, fitted, self._others, gain)
+            return best
         near = [f for g, f in fitted if f is not best and g > decisions.STEADY * gain]
         steady = [f.newest for f in near if f.newest.effect.family is Family.STEADY]
         search.close[term.label] = steady
@@ -233,6 +238,8 @@ class _FluxSelection(ForwardSelection[Fit]):
                 if _is_surpassed(expected, term, fitted):  # by one that was fitted beside it
                     continue
                 newest = fit.newest
+                if any(newest.belongs_to(term) for term in before.terms):
+                    continue
                 if newest.theta.size and not newest.theta[newest.effect.amounts(newest)].any():
                     continue  # at its bound, where it is nothing
                 gain = scorer.held_out - fit.held_out() - choice.taken_from_others(fit)

@@ -19,6 +19,10 @@ from anser_ros.effects.effect import Effect, Remedy, Site, Term, sigmas
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 
+PHASE_ALONE = 0.3
+"""A gain whose modulus is off by less than this share of its phase is a phase: drivers and cables
+turn currents by milliradians and leave their size. Larger hides a gain beside a phase."""
+
 
 class ComplexGain(Effect[Term]):
     """Theta is the real and imaginary part of (gain - 1) of what the site names."""
@@ -26,6 +30,15 @@ class ComplexGain(Effect[Term]):
     plausible = {'gain': (0.2, 3.0), 'phase_deg': (-60.0, 60.0)}
     remedy = Remedy.FLUX
     typical = 0.3  # gains are within some ten percent of one
+
+    def rivals(self, term: Term, other: Term) -> bool:
+        """Rival phases of emitters where the modulus is hardly another one.
+
+        If all phases are off, what is left of them last is also a phase of the channels.
+        """
+        gain = 1 + complex(*term.theta)
+        phase = abs(float(np.angle(gain)))
+        return bool(other.effect.gregarious) and abs(abs(gain) - 1) < PHASE_ALONE * phase
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Record modulus and argument of the gain, each with its deviation along its own way."""
@@ -266,6 +279,11 @@ class Pickup(Effect[Term]):
         return Term(self, self.site_of(record), parts.T.ravel() / PICKUP_UNIT)
 
 
+ONE_EMITTER = 0.9
+"""Share of a reference's changed power from which it is one emitter's: what moves a reference, or
+disturbs it, shows in others too."""
+
+
 class ReferenceChanged(Pickup):
     """Acts as `Pickup` on a reference sensor, which rests: any lasting change is a constant."""
 
@@ -278,6 +296,12 @@ class ReferenceChanged(Pickup):
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         ours = apparatus.tool_channels
         return self._at([c for c in apparatus.channels if c not in ours], apparatus)
+
+    def belongs(self, term: Term, other: Term) -> bool:
+        """Belong to an emitter that moved, if hardly another one's readings have changed."""
+        power = np.abs(complex_of(term.theta)) ** 2
+        own = power[other.site['coil']] if other.effect.gradient_error else 0.0
+        return bool(own > ONE_EMITTER * power.sum())
 
 
 SATURATION_UNIT = 1e12

@@ -57,7 +57,7 @@ class CoilPhase(Effect[Term]):
     remedy = Remedy.FLUX
     typical = 30.0  # phases of amplifiers and of their references are off by some degrees
     recorded = {'phase_rad': (1, PHASE_UNIT)}
-    inexact = 0.05  # phases of single sensors, which it leaves, are off by some mrad too
+    inexact = 0.1  # phases of single sensors, which it leaves, are off by some mrad too
     gregarious = True  # one wrong reference of the phases turns all of them, each by its own
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
@@ -392,9 +392,7 @@ class EmitterSize(Effect[EmitterSizeTerm]):
 
     name = 'emitter_size'
     summary = 'an emitter is longer or flatter than its model'
-    units = {
-        'coil': '1', 'second_moment_m2': 'm^2', 'length_m': 'm', 'diameter_m': 'm',
-    }  # fmt: skip
+    units = {'coil': '1', 'second_moment_m2': 'm^2', 'length_m': 'm', 'diameter_m': 'm'}
     plausible = {'length_m': (0.0, 1.0), 'diameter_m': (0.0, 1.0)}
     remedy = Remedy.FIELD
     typical = 100.0  # of magnets and coils of some decimetres
@@ -430,16 +428,8 @@ class EmitterSize(Effect[EmitterSizeTerm]):
     def record(self, term: EmitterSizeTerm, covariance: Array) -> EffectRecord:
         sigma_m2 = SIZE_UNIT * float(np.sqrt(covariance[0, 0]))
         figures, sigmas = size_figures(term.second_moment_m2, sigma_m2)
-        return EffectRecord(
-            self.name,
-            {
-                'coil': term.site['coil'],
-                **figures,
-                'model_second_moment_m2': term.modelled_m2,
-                'axis': term.axis.tolist(),
-            },
-            sigmas,
-        )
+        own = {'model_second_moment_m2': term.modelled_m2, 'axis': term.axis.tolist()}
+        return EffectRecord(self.name, {'coil': term.site['coil'], **figures, **own}, sigmas)
 
     def term(self, record: EffectRecord) -> EmitterSizeTerm:
         modelled = float(record.needed('model_second_moment_m2'))
@@ -451,13 +441,6 @@ class EmitterSize(Effect[EmitterSizeTerm]):
 
 
 EFFECTS = (
-    CoilGain(),
-    CoilPhase(),
-    CoilDrift(),
-    CoilPhaseDrift(),
-    CommonDrift(),
-    CoilCrosstalk(),
-    CoilMoved(),
-    CoilTurned(),
-    EmitterSize(),
-)
+    CoilGain(), CoilPhase(), CoilDrift(), CoilPhaseDrift(), CommonDrift(), CoilCrosstalk(),
+    CoilMoved(), CoilTurned(), EmitterSize(),
+)  # fmt: skip

@@ -94,6 +94,7 @@ class CoilFluctuation(Fluctuation):
     remedy = Remedy.FLUX
     drifts = True
     followed = True
+    inexact = 0.05  # a step is not normal, and an emitter's own shape stays in its readings alone
 
 
 class LooseCluster(Fluctuation):

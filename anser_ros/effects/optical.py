@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, cast
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import Array, ComplexArray, Integers
@@ -44,24 +45,25 @@ def flux_rate(view: View) -> ComplexArray:
 
 
 class TimeOffset(OpticalEffect[Term]):
-    """Applies the optical pose stamped t - theta at flux stamp t; theta is in s."""
+    """Takes an optical stamp t' (s) for t' + a, theta, so that the pose of t - a belongs to t."""
 
     name = 'time_offset'
     summary = 'the optical stamps are early or late'
     units = {'offset_s': 's'}
     plausible = {'offset_s': (-0.5, 0.5)}
     recorded = {'offset_s': (1, 1.0)}
-    typical = (0.1,)
+    typical: ClassVar[tuple[float, ...]] = (0.1,)
 
     def slopes(self, term: Term, view: View) -> ComplexArray:
-        """Return minus the flux's rate of change."""
-        return -flux_rate(view)[..., None]
+        """Return minus the flux's rate of change, constant and, with a rate, growing with time."""
+        rate, time = -flux_rate(view), view.time[:, None, None]
+        return np.stack([rate * time**power for power in range(term.theta.size)], axis=-1)
 
     def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
-        return replace(track, time=track.time + term.theta[0])
+        return replace(track, time=track.time + polyval(track.time, term.theta))
 
 
-class ClockRate(OpticalEffect[Term]):
+class ClockRate(TimeOffset):
     """Theta is an offset a (s) and a rate b (s a second): optical t' counts as t' + a + b t'."""
 
     name = 'clock_rate'
@@ -70,14 +72,6 @@ class ClockRate(OpticalEffect[Term]):
     plausible = {'offset_s': (-0.5, 0.5), 'rate_ppm': (-2e4, 2e4)}
     recorded = {'offset_s': (1, 1.0), 'rate_ppm': (1, 1e6)}
     typical = (0.1, 3e-3)
-
-    def slopes(self, term: Term, view: View) -> ComplexArray:
-        """Return minus the flux's rate of change, constant and growing with time."""
-        rate = -flux_rate(view)
-        return np.stack([rate, rate * view.time[:, None, None]], axis=-1)
-
-    def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
-        return replace(track, time=track.time * (1 + term.theta[1]) + term.theta[0])
 
 
 class Registration(OpticalEffect[Term]):
@@ -132,6 +126,10 @@ class OpticalScale(OpticalEffect[Term]):
 
     def prior(self, term: Term) -> Array:
         return np.concatenate([np.full(term.theta.size - 3, 0.01), np.full(3, 5e-3)])
+
+    def rivals(self, term: Term, other: Term) -> bool:
+        """Rival a frame that stands elsewhere; what it leaves then shows the axis."""
+        return 'axis' in term.site and other.effect.is_frame
 
     def complexity(self, term: Term) -> int:
         """Return that of a registration and its own: a frame that stands elsewhere goes before."""

@@ -23,6 +23,13 @@ class Wiring(Effect[Term]):
         return Term(self, self.site_of(record))
 
 
+def _exchanged(size: int, shown: Sequence[int], true: Sequence[int]) -> ComplexArray:
+    """Return the matrix that shows rows in the place of others, (size, size)."""
+    order = np.arange(size)
+    order[list(shown)] = true
+    return np.eye(size, dtype=complex)[order]
+
+
 class SwappedChannels(Wiring):
     """Reads each of ``channels`` at the place of the one in ``read_as``."""
 
@@ -34,13 +41,10 @@ class SwappedChannels(Wiring):
     def channel_matrix(self, term: Term, channels: Integers) -> ComplexArray:
         """Return a permutation; channels of which one is missing stay as they are."""
         row = {int(c): i for i, c in enumerate(channels)}
-        matrix = np.eye(channels.size, dtype=complex)
         if not all(c in row for c in term.site['channels']):
-            return matrix
-        for shown, true in zip(term.site['read_as'], term.site['channels'], strict=True):
-            matrix[row[shown]] = 0.0
-            matrix[row[shown], row[true]] = 1.0
-        return matrix
+            return np.eye(channels.size, dtype=complex)
+        shown, true = ([row[c] for c in term.site[key]] for key in ('read_as', 'channels'))
+        return _exchanged(channels.size, shown, true)
 
 
 class SwappedCoils(Wiring):
@@ -52,11 +56,7 @@ class SwappedCoils(Wiring):
     remedy = Remedy.FLUX
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        matrix = np.eye(omega.size, dtype=complex)
-        for shown, true in zip(term.site['read_as'], term.site['coils'], strict=True):
-            matrix[shown] = 0.0
-            matrix[shown, true] = 1.0
-        return matrix[None]
+        return _exchanged(omega.size, term.site['read_as'], term.site['coils'])[None]
 
 
 class DeadChannel(Wiring):

@@ -84,16 +84,11 @@ class SensorAxis(Effect[SensorAxisTerm]):
             return EffectRecord(self.name, parameters, {'rotation_deg': sigma})
         tilt = float(np.linalg.norm(term.theta))
         unit = term.theta / max(tilt, 1e-12)
-        return EffectRecord(
-            self.name,
-            {
-                'channel': term.site['channel'],
-                'tilt_deg': float(np.degrees(np.arctan(tilt))),
-                'axis': self._tilted(term).tolist(),
-                'surveyed_axis': list(term.surveyed),
-            },
-            {'tilt_deg': float(np.degrees(np.sqrt(unit @ covariance @ unit)))},
-        )
+        sigma_deg = float(np.degrees(np.sqrt(unit @ covariance @ unit)))
+        tilt_deg = float(np.degrees(np.arctan(tilt)))
+        found = {'tilt_deg': tilt_deg, 'axis': self._tilted(term).tolist()}
+        parameters = {**term.recorded_site, **found, 'surveyed_axis': list(term.surveyed)}
+        return EffectRecord(self.name, parameters, {'tilt_deg': sigma_deg})
 
     def term(self, record: EffectRecord) -> SensorAxisTerm:
         if 'channels' in record.parameters:
@@ -267,11 +262,8 @@ class SensorSize(Effect[SensorSizeTerm]):
         base = float(np.mean(np.square(list(term.surveyed.values()))))
         length = float(np.sqrt(max(base + SIZE_UNIT * term.theta[0], 0.0)))
         sigma = SIZE_UNIT * float(np.sqrt(covariance[0, 0])) / (2 * max(length, 1e-4))
-        parameters = {
-            'length_m': length,
-            'channels': list(term.surveyed),
-            'surveyed_length_m': list(term.surveyed.values()),
-        }
+        surveyed = {'surveyed_length_m': list(term.surveyed.values())}
+        parameters = {'length_m': length, 'channels': list(term.surveyed), **surveyed}
         return EffectRecord(self.name, parameters, {'length_m': sigma})
 
     def term(self, record: EffectRecord) -> SensorSizeTerm:

@@ -227,6 +227,8 @@ def plausible_tools(
     evidence, in one line.
     """
     nominal, kept, words = NominalBoard.of(setup), [], []
+    if tools and not any(np.nan_to_num(tool.flux).any() for tool in tools):
+        raise PlausibilityError(f'{path}: all fluxes of all tools are zero: an empty band?')
     for tool in tools:
         words += _check_refused(path, tool, refused)
         _check_clocks(path, tool)
