@@ -145,7 +145,7 @@ class TestWriteSession:
         assert not path.exists()
 
     def test_a_bag_is_replaced_only_when_asked(self, tmp_path):
-        path, times, flux = tmp_path / 'a.mcap', np.arange(3), np.zeros((3, 2, 2))
+        path, times, flux = tmp_path / 'a.mcap', np.arange(3), np.full((3, 2, 2), 1e-9)
         write_session(path, SETUP, times, flux)
         with pytest.raises(BagError, match='already exists'):
             write_session(path, SETUP, times, flux)

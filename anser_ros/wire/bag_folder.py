@@ -10,7 +10,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from anser_ros.stamps import SECOND_NS
-from anser_ros.wire.bag_writer import BagRecord, BagWriter, together, write_metadata
+from anser_ros.wire.bag_writer import (
+    FLUSHED_CHUNK_BYTES,
+    BagRecord,
+    BagWriter,
+    together,
+    write_metadata,
+)
 
 SNAPSHOT = 'snapshot_'
 """How the names of folders with a snapshot begin; date and time follow."""
@@ -123,7 +129,7 @@ class BagFolder:
 
     def _open(self) -> None:
         name = f'{self.path.name}_{len(self._files)}.mcap'
-        self._bag = BagWriter(self.path / name)
+        self._bag = BagWriter(self.path / name, chunk_bytes=FLUSHED_CHUNK_BYTES)
         self._files[name] = self._bag.record
         for topic in self._topics:
             self._channels[topic.name] = self._bag.add_topic(*topic)

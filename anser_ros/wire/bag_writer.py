@@ -164,9 +164,11 @@ def _topic(topic: TopicRecord) -> dict[str, Any]:
     }
 
 
-CHUNK_BYTES = 8 * 1024 * 1024
-"""Size of a chunk, bytes, above what `CHUNK_NS` of a session takes while metal moves (1.3 MB/s);
-with smaller ones the index in memory grows: 25 MB an hour with 256 KB."""
+CHUNK_BYTES = 256 * 1024
+"""Size of a chunk, bytes: what a bag loses at most that is cut off."""
+FLUSHED_CHUNK_BYTES = 8 * 1024 * 1024
+"""The same where messages are flushed: more than `CHUNK_NS` of them take while metal moves (1.3
+MB/s). With smaller chunks the index in memory grows by 35 MB an hour."""
 CHUNK_NS = 6_000_000_000
 """Longest time in a chunk while messages are flushed, ns. The index of an hour takes 1.1 MB of
 memory with twelve topics and 2.7 with forty."""
@@ -231,7 +233,9 @@ class BagWriter:
     whole session. Raises `BagError`: the file exists already, or cannot be made.
     """
 
-    def __init__(self, path: str | Path, raw: BinaryIO | None = None) -> None:
+    def __init__(
+        self, path: str | Path, raw: BinaryIO | None = None, chunk_bytes: int = CHUNK_BYTES
+    ) -> None:
         self.path = Path(path)
         self.record = BagRecord()
         self._reserve: int | None = None
@@ -248,7 +252,7 @@ class BagWriter:
         assert raw is not None
         self._raw = raw
         self._segments = _Segments(raw)
-        self._writer = Writer(self._segments, CHUNK_BYTES)  # type: ignore[arg-type]
+        self._writer = Writer(self._segments, chunk_bytes)  # type: ignore[arg-type]
         # What came since the last flush; None where the file lacks a topic of it.
         self._draft: Writer | None = None
         self._draft_bytes = io.BytesIO()
