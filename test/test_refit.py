@@ -95,8 +95,9 @@ def test_an_emitter_that_drifts_is_followed_without_inventing_metal(refit):
 def test_a_drift_of_all_emitters_may_be_the_references_own_gain_that_moves_no_tool(refit):
     world = anser_world()
     for step in range(40):
-        result = run(refit, world, 2.5e-4 * step * world.baseline, frames=1, start=1 + step)
-    assert np.abs(result.drift - 0.01).max() < 1e-3
+        result = run(refit, world, 1.5e-3 * step * world.baseline, frames=1, start=1 + step)
+    assert np.abs(result.drift - 0.06).max() < 5e-3
+    assert result.weights['nothing'] > 0.9
     _, _, sigma, error = errors(world, result.model, HEAD, 0.0)
     assert 0.9 < np.sqrt(np.mean((np.abs(error) / sigma) ** 2)) < 1.5
 

@@ -170,7 +170,7 @@ class LiveRefit:
         if used is not ordered:
             mean = np.where(np.isfinite(mean), mean, ordered)
         noise = level / math.sqrt(frames)
-        values = self._units.of(mean - self.baseline)
+        values = self._units.of(mean / (1.0 + self._motion.gain) - self.baseline)
         bank, seen = self._judged(stamp_ns, values, noise)
         if self._watch.used < self.settings.min_references:
             return self._too_few(stamp_ns, level)
@@ -261,13 +261,14 @@ class LiveRefit:
         sure = (np.abs(mean) > DRIFT_SIGMAS * np.sqrt(np.maximum(variance, 1e-30))).any(axis=1)
         if not moving:
             drift[~sure] = 0.0
+        drift += self._motion.gain
         model, state, reason = self.model, FROZEN, ''
         unit = self.settings.accuracy.flux_noise_t
         if self._witness is not None and moving:
             self._witness.predict(stamp_ns, bank, seen, weights, drift)
         elif self._witness is not None:
             self._witness.forget()
-        if moving or sure.any():
+        if moving or drift.any():
             witness = self._witness if moving else None
             model = self._assembly.model(stamp_ns, bank, seen, weights, drift, typical, witness)
             state = REFIT

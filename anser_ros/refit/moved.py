@@ -1,9 +1,12 @@
-"""Asks whether the frame of the references, or an emitter, has moved, beside metal or without.
+"""Asks whether the frame of the references, or an emitter, has moved, or a gain that all have in
+common, beside metal or without.
 
 What slides as one is no metal, but clouds of metal explain a slide quite well, and a model that
 follows them is wrong by as much. So "this has moved, and metal may be there too" is a hypothesis
 beside each of a bank's: to its covariance come the columns of what such a motion makes of the
-baseline. Its evidence is against the same baseline however slow the slide is.
+baseline. Its evidence is against the same baseline however slow the slide is. So it is for the
+gain of all references, or of all emitters, which references cannot tell from each other: it is
+learnt, and the readings are looked at without it.
 The rules are those of `refit.posterior`: ``1/2 b^T (1 + M)^-1 b - 1/2 log |1 + M|`` is what the
 columns X, whose factors have a variance of one, add to the log likelihood of readings y with the
 precision P, where ``M = X^T P X`` and ``b = X^T P y``.
@@ -26,6 +29,9 @@ LOOK_S = 0.16
 MOVED_ODDS = 20.0
 """Log odds from which on a motion is believed: metal of independent recordings reaches -12 where
 an X-ray head touches the board, and simulated slides of 0.05 mm are at 100 to 200."""
+COMMON_GAIN, LEAST_GAIN = 0.05, 1e-4
+"""Standard deviation of a gain that all references, or all emitters, have in common, as when one
+amplifier or supply warms up; and the least that counts: it moves no pose by more than 10 um."""
 MOST_KEPT = 64
 """Hypotheses at a noise level whose matrices are kept."""
 
@@ -34,9 +40,11 @@ class FrameMotion:
     """Watches the frame of some references in the in-phase ``field`` of some ``emitters``, K.
 
     ``noise_t`` is the unit of readings, T. ``reason`` is what counts as moved; empty for nothing.
+    ``gain`` is the change of the common gain that has been learnt.
     """
 
     reason: str
+    gain: float
 
     def __init__(
         self, field: FieldFunction, references: SensorTable, emitters: Sequence[str],
@@ -47,16 +55,16 @@ class FrameMotion:
         self.forget()
         drawn = DrawnReadings.of(field, references.position, references.axis, references.length)
         whole = PRIOR_M * drawn.by_place, PRIOR_RAD * drawn.turned(np.zeros(3))
-        # (1 + K, 6, S, K): an emitter that moves leaves the readings of the others as they are.
-        columns = np.zeros((1 + len(emitters), 6, *drawn.flux.shape))
-        columns[0] = np.concatenate(whole)
+        # (2 + K, 6, S, K): an emitter that moves leaves the readings of the others as they are.
+        columns = np.zeros((2 + len(emitters), 6, *drawn.flux.shape))
+        columns[0], columns[-1, 0] = np.concatenate(whole), COMMON_GAIN * drawn.flux
         for k in range(len(emitters)):
             columns[1 + k, :3, :, k] = -whole[0][:, :, k]
         self._columns = columns.reshape(*columns.shape[:2], -1).swapaxes(1, 2) / noise_t
 
     def forget(self) -> None:
         """Believe that nothing has moved, and look with the next frame."""
-        self._next_ns, self._away, self.reason = 0.0, (0, 0.0), ''
+        self._next_ns, self._away, self.reason, self.gain = 0.0, (0, 0.0), '', 0.0
 
     def look(self, stamp_ns: int, bank: Bank, seen: FrameEvidence) -> None:
         """Take in a frame's evidence; it is looked at every `LOOK_S`."""
@@ -68,11 +76,13 @@ class FrameMotion:
             columns, inverse, half_log_det = self._known_of(bank, hypothesis, seen.noise)
             precision, curve = bank.precision(seen.noise)[0], seen.curve[hypothesis, 0]
             weighted = precision[hypothesis] * seen.projected[hypothesis, :, 0]
-            b = weighted @ columns  # (1 + K, A, 6)
+            b = weighted @ columns  # (2 + K, A, 6)
             moved = (inverse @ b[..., None])[..., 0]
             gained = curve + 0.5 * (b * moved).sum(axis=2) - half_log_det
             evidence = np.logaddexp.reduce(gained, axis=1) - log_sum(curve)
             evidence += float(seen.log_evidence[hypothesis])
+            if hypothesis > 0:
+                evidence[-1] = -np.inf
             odds = np.logaddexp(odds, evidence)
             what = int(evidence.argmax())
             if evidence[what] > best[0]:
@@ -81,6 +91,10 @@ class FrameMotion:
                 best = float(evidence[what]), what, moved[what, top], sigma
         # Far away a motion is not linear any more, and not seen beside metal: it must come back.
         if float(odds.max()) - log_sum(seen.log_evidence) > MOVED_ODDS:
+            if best[1] == len(odds) - 1:
+                gain = self.gain + COMMON_GAIN * float(best[2][0])
+                self.gain = gain if abs(gain) > LEAST_GAIN else 0.0
+                return
             self.reason = self._said(*best[1:])
         elif seen.best == 0:
             self.reason, self._away = '', (0, 0.0)
@@ -103,15 +117,15 @@ class FrameMotion:
 
     def _known_of(self, bank: Bank, hypothesis: int, noise: float) -> tuple[Array, Array, Array]:
         """Return what a hypothesis and the noise decide for each thing that may move: the columns
-        (1 + K, n, 6) in its eigenvectors, and for each strength ``(1 + M)^-1`` (1 + K, A, 6, 6)
-        and half of ``log |1 + M|`` (1 + K, A).
+        (2 + K, n, 6) in its eigenvectors, and for each strength ``(1 + M)^-1`` (2 + K, A, 6, 6)
+        and half of ``log |1 + M|`` (2 + K, A).
         """
         key = (bank.rows.tobytes(), bank.names[hypothesis], noise)
         if key not in self._known:
             make_room(self._known, MOST_KEPT)
             columns = bank.bases[hypothesis].T @ self._columns[:, bank.rows]
             precision = bank.precision(noise)[0][hypothesis]
-            rows = columns.swapaxes(1, 2)[:, None] * precision[:, None, :]  # (1 + K, A, 6, n)
+            rows = columns.swapaxes(1, 2)[:, None] * precision[:, None, :]  # (2 + K, A, 6, n)
             square = rows.reshape(len(rows), -1, rows.shape[3]) @ columns
             inside = np.eye(6) + square.reshape(*rows.shape[:3], 6)
             half = 0.5 * np.linalg.slogdet(inside)[1]

@@ -291,6 +291,8 @@ RECORDED = (
           partial(faded, references=32, coils=ONE), DRIFTS),
     Drift('references-parallel', 'the same, two coils',
           partial(faded, references=32, coils=PARALLEL), DRIFTS),
+    Drift('references-metal', 'the same, one coil, near moving metal',
+          partial(faded, references=32, coils=ONE, metal=True), DRIFTS),
     Drift('fade-one', 'an emitter falls, no references, %/min', partial(faded, refit=False),
           DRIFTS),
     Drift('fade-all', 'all emitters fall, no references, %/min',
