@@ -166,6 +166,24 @@ def test_a_plate_of_typed_places_calibrates(setup, heights, most_m):
     assert 'frame' in result.undetermined[0]
 
 
+@pytest.mark.parametrize(
+    ('change', 'said'),
+    [
+        (
+            lambda places: places * [0.98, 0.98, 1.0],
+            'the plate comes out 0\\.2\\d % larger than typed',
+        ),
+        (lambda places: places + 3e-3 * np.eye(len(places))[24][:, None], r'mm is \d\.\d mm off'),
+    ],
+)
+def test_a_pitch_or_a_place_that_is_a_little_wrong_is_said(setup, change, said):
+    session = World(setup, 5).grid([0.084])
+    assert not calibrated(session).contradictions
+    (tool,) = session.tools
+    wrong = replace(session, tools=(replace(tool, position=change(tool.position)),))
+    assert re.search(said, ' '.join(calibrated(wrong).contradictions))
+
+
 def test_a_tool_moved_by_hand_calibrates_without_a_camera(setup):
     world = World(setup, 6)
     result = calibrated(world.waved(15.0))

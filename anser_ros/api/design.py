@@ -140,7 +140,8 @@ def plot_field(
     from matplotlib import pyplot  # late: it takes a second
     from matplotlib.colors import LogNorm
 
-    field, names = Model.load(model).field, model.emitters
+    model = Model.load(model)
+    field, names = model.field, model.emitters
     column = names.index(emitter) if emitter in names else emitter
     if not (isinstance(column, int) and 0 <= column < len(names)):
         raise ParameterError(f'no emitter {emitter!r}; there are: {", ".join(names)}')

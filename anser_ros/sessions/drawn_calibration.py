@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from anser_ros.arrays import Array
 from anser_ros.calibration.calibrate import Options
-from anser_ros.calibration.drawn_fit import DrawnFit, DrawnFitter, evenly
+from anser_ros.calibration.drawn_fit import PLACE, PLATE, DrawnFit, DrawnFitter, evenly
 from anser_ros.calibration.held_out import HeldOutTally
 from anser_ros.calibration.layout_fit import RICH
 from anser_ros.calibration.layouts import Generator, Layout
@@ -28,7 +28,14 @@ from anser_ros.calibration.readings import (
     usable_weights,
     with_pose,
 )
-from anser_ros.calibration.result import Calibration, Scan, corrections, residuals, with_provenance
+from anser_ros.calibration.result import (
+    OUTLIER_WEIGHT,
+    Calibration,
+    Scan,
+    corrections,
+    residuals,
+    with_provenance,
+)
 from anser_ros.calibration.sensor_fit import SensorFit
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
@@ -264,7 +271,8 @@ def _calibration(
         residuals=residuals(now, model),
         scan=Scan(now, accuracy, corrected, (), sensors if all(typed) else None),
         nominal_rmse_t=residuals(stated, nominal).rmse_t if all(typed) and nominal else None,
-        undetermined=(frame,), emitters=emitter_rows(fit, generator), more={
+        undetermined=(frame,), contradictions=_doubts(fit),
+        emitters=emitter_rows(fit, generator), more={
             'frame': {
                 'shift_sigma_m': fit.frame_sigma[:3].tolist(),
                 'turn_sigma_rad': fit.frame_sigma[3:].tolist(),
@@ -277,6 +285,33 @@ def _calibration(
     )  # fmt: skip
 
 
+def _doubts(fit: DrawnFit) -> tuple[str, ...]:
+    """A line for a plate, and for each of its places, that is off by far more than such are."""
+    lines, scale = [], float(fit.plate[6])
+    if abs(scale) > FAR * PLATE[6]:
+        size = f'{100 * abs(scale):.2f} % {"larger" if scale > 0 else "smaller"}'
+        true = f'and plates are true to {100 * PLATE[6]:.2f} %'
+        lines.append(f'the plate comes out {size} than typed, {true}: is the pitch right?')
+    typed = [part for part in fit.parts if part.is_typed]
+    if not typed:
+        return tuple(lines)
+    place = np.concatenate([part.stated.position for part in typed])
+    away = np.concatenate([np.linalg.norm(part.offset[:, :3], axis=1) for part in typed])
+    weight = np.concatenate([part.weights.max(axis=1) for part in typed])
+    doubted = (away > FAR * PLACE[0]) | ((weight > 0.0) & (weight < OUTLIER_WEIGHT))
+    worst = np.flatnonzero(doubted)
+    for k in worst[np.argsort(-away[worst])][:MOST_LINES]:
+        at = ', '.join(f'{one:.1f}' for one in 1e3 * place[k])
+        fits = weight[k] > OUTLIER_WEIGHT
+        how = f'is {1e3 * away[k]:.1f} mm off' if fits else 'does not fit at all'
+        lines.append(f'the reading typed at {at} mm {how}: is the place right, and the order?')
+    if len(worst) > MOST_LINES:
+        lines.append(f'so are {len(worst) - MOST_LINES} more of {len(place)} places')
+    return tuple(lines)
+
+
+FAR, MOST_LINES = 4.0, 3
+"""Standard deviations from which on a plate or place is doubted aloud; lines for single places."""
 WORDS = 'those of the drawn coils, each a little off, and a weak layer'
 """The layout in words for a report."""
 WAYS = (('left', 'right'), ('front', 'back'), ('down', 'up'))

@@ -62,8 +62,8 @@ def places_of(name: str, pitch_m: float = 0.0, heights_m: Sequence[float] = ()) 
         return read_table(name).positions()
     side, pitch, height = PLATES[name]
     step, heights = pitch_m or pitch, heights_m or [height]
-    if not (0.0 < step < 1.0 and all(0.0 < height < 1.0 for height in heights)):
-        raise ParameterError('pitch and heights must be between 0 and 1 m')
+    if not all(1e-3 <= one < 1.0 for one in (step, *heights)):
+        raise ParameterError('pitch and heights must be between 1 and 1000 mm')
     line = step * (np.arange(side) - (side - 1) / 2.0)
     return np.array([(x, y, z) for z in heights for y in line for x in line])
 
