@@ -1,6 +1,6 @@
 """Finds in which order, sense and unit poses were written, where they do not fit as they stand."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses import start
-from anser_ros.apps.poses.effect import Role, effect_with
+from anser_ros.apps.poses.effect import PoseTerm, Role, effect_with
 from anser_ros.apps.poses.problem import PoseProblem
 from anser_ros.apps.poses.sequence import REFERENCE, PoseSequence, PoseSession
 from anser_ros.arrays import Array
@@ -103,9 +103,9 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
     is_turned = cost < POOR_M and _is_turned(as_written)
     if cost < POOR_M and not is_turned:
         return as_written, record
-    offset = start.coarse_offset(_few(as_written))  # which no reading of the tracked poses changes
+    clock = start.coarse_clock(_few(as_written))  # which no reading of the tracked poses changes
     trials = [
-        (_cost(reading.applied(session), None if reading.stream == REFERENCE else offset), reading)
+        (_cost(reading.applied(session), None if reading.stream == REFERENCE else clock), reading)
         for reading in _readings(unit)
     ]
     best, reading = min(trials, key=lambda pair: pair[0])
@@ -160,10 +160,9 @@ def _few(session: PoseSession) -> PoseProblem:
     return problem.rows([np.arange(0, poses.size, step) for poses in problem.sensors])
 
 
-def _cost(session: PoseSession, offset: float | None = None) -> float:
+def _cost(session: PoseSession, clock: Sequence[PoseTerm] | None = None) -> float:
     problem = _few(session)
-    offset = start.coarse_offset(problem) if offset is None else offset
-    return start.first_cost(start.first_fit(problem, offset, False))
+    return start.first_cost(start.first_fit(problem, clock or start.coarse_clock(problem), False))
 
 
 def _is_turned(session: PoseSession) -> bool:
@@ -173,9 +172,9 @@ def _is_turned(session: PoseSession) -> bool:
     the other half is their mirror image.
     """
     problem = start.pose_problem(session)
-    offset, misfits = start.coarse_offset(problem), []
+    clock, misfits = start.coarse_clock(problem), []
     for poses in problem.sensors:
-        _, turn, _, known = problem.path.at(poses.time - offset)
+        _, turn, _, known = problem.path.at(start.times_by(clock, poses))
         optical = Rotation.from_matrix(turn[known]).as_quat()
         tracked = poses.quaternion[known]
         if len(tracked):

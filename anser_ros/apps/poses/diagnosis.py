@@ -275,13 +275,13 @@ def diagnose_poses(
     say('hand-eye')
     alone = session.reference is None
     training = problem.in_blocks(train)
-    first = start.first_fit(training, start.coarse_offset(training), alone)
+    first = start.first_fit(training, start.coarse_clock(training), alone)
     swaps = start.swapped_spans(problem, first)
     session, swapped = start.put_back(session, swaps)
     if swaps:
         problem = start.pose_problem(session)
         training = problem.in_blocks(train)
-        first = start.first_fit(training, start.coarse_offset(training), alone)
+        first = start.first_fit(training, start.coarse_clock(training), alone)
     search = _outside_episodes(search_effects(first, session, say, is_searched), session, say)
     say('held out')
     state = search.fit.state

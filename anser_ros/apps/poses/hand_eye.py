@@ -21,7 +21,7 @@ from anser_ros.apps.poses.fit import (
 from anser_ros.apps.poses.problem import PoseProblem
 from anser_ros.apps.poses.search import PoseEvidence, frame_terms, with_noise
 from anser_ros.apps.poses.sequence import PoseSession
-from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem, train_blocks
+from anser_ros.apps.poses.start import coarse_clock, first_fit, pose_problem, train_blocks
 from anser_ros.arrays import Array
 from anser_ros.effects.effect import sigmas
 from anser_ros.errors import DiagnosisError
@@ -242,7 +242,7 @@ def fit_hand_eye(
 
 def _fitted(problem: PoseProblem) -> PoseFit:
     """The frames, and the clocks as far as the motion determines them."""
-    fit = first_fit(problem, coarse_offset(problem), False)
+    fit = first_fit(problem, coarse_clock(problem), False)
     if problem.path.is_at_rest:
         return with_noise(fit_poses(fit.state.problem, frame_terms(fit.terms)))
     rate = effect_with(Role.RATE).sites(problem.setting)[0]

@@ -326,19 +326,25 @@ class OpticalPath:
 
         Times without a valid path get the nearest pose, at rest.
         """
-        inside, valid = np.clip(time, self.knots[0], self.knots[-1]), self._valid(time)
-        values, slopes = self._spline(inside), self._spline(inside, 1)
-        norm = np.maximum(np.linalg.norm(values[:, 3:], axis=1, keepdims=True), 1e-6)
-        turn, rate = values[:, 3:] / norm, slopes[:, 3:] / norm
+        place, turn, norm, valid = self.fixed(time)
+        slopes = self._spline(np.clip(time, self.knots[0], self.knots[-1]), 1)
+        rate = slopes[:, 3:] / norm
         velocity = np.zeros((time.size, 6))
         velocity[:, :3] = slopes[:, :3]
         vector, scalar, d_vector, d_scalar = turn[:, :3], turn[:, 3:], rate[:, :3], rate[:, 3:]
         velocity[:, 3:] = 2 * (d_vector * scalar - d_scalar * vector - np.cross(d_vector, vector))
         velocity[~valid | self.is_at_rest] = 0.0
         matrices = np.asarray(Rotation.from_quat(turn).as_matrix()).reshape(-1, 3, 3)
+        return place, matrices, velocity, valid
+
+    def fixed(self, time: Array) -> tuple[Array, Array, Array, Booleans]:
+        """Return positions (n, 3), quaternions (n, 4), their norm before, and validity."""
+        values = self._spline(np.clip(time, self.knots[0], self.knots[-1]))
+        norm = np.maximum(np.linalg.norm(values[:, 3:], axis=1, keepdims=True), 1e-6)
+        valid = self._valid(time)
         if self.source is not None:
             valid = valid & self.source._valid(time)
-        return values[:, :3], matrices, velocity, valid
+        return values[:, :3], values[:, 3:] / norm, norm, valid
 
     def _valid(self, time: Array) -> Booleans:
         """Where it is interpolated: between poses that are near each other."""

@@ -42,8 +42,9 @@ COARSE_POSES = 300  # poses of that look; it takes a regression at each of its s
 FAR_STEP_S, FASTEST = 0.1, 3e-3
 """Step, s, of looks beyond that range and at clocks that run apart, by this share at most."""
 LEAST_OVERLAP = 0.25  # share of the poses that must have a reference at an offset
-ALIKE, UNLIKE = 0.8, 0.2
-"""Correlation of one body's motions at the right time (chance: 0.5), and how much it must gain."""
+ALIKE, UNLIKE = 0.8, 0.5
+"""Correlation of one body's motions at the right time (chance: 0.5), and the share that must be
+left of what another lacks of one: a clock that runs apart slowly leaves some of them alike."""
 HAND_S = 0.3  # time, s, in which a hand turns and moves by what it is told by
 COARSE_OFFSET_MISFIT = 0.8
 """Share of the misfit at no offset below which a coarse offset is taken; chance takes off 6 %."""
@@ -216,13 +217,21 @@ def train_blocks(problem: PoseProblem) -> tuple[Integers, Integers]:
     return every[~held], every[held]
 
 
-def coarse_offset(problem: PoseProblem) -> float:
-    """Return the offset, s, at which tracked places are most nearly linear in the optical pose.
+def coarse_clock(problem: PoseProblem) -> list[PoseTerm]:
+    """Return the offset of a clock to start from, and its rate where it runs apart by far."""
+    offset, rate = 0.0, 0.0
+    if not problem.path.is_at_rest:
+        offset, rate = _coarse_rate(problem, _coarse_offset(problem))
+    clock = [PoseTerm(effect_with(Role.OFFSET), {}, np.array([offset]))]
+    rates = effect_with(Role.RATE).sites(problem.setting) if rate else ()
+    return [*clock, *(term.with_theta(np.array([1e3 * rate])) for term in rates)]
+
+
+def _coarse_offset(problem: PoseProblem) -> float:
+    """The offset, s, at which tracked places are most nearly linear in the optical pose.
 
     Where the motion is not alike then, it is that within the length of a recording at which it is.
     """
-    if problem.path.is_at_rest:
-        return 0.0
     chosen = [p.rows(slice(None, None, max(1, p.size // COARSE_POSES))) for p in problem.sensors]
     longest = longest_recording(problem)
     reach = min(COARSE_S, SHORT_SHARE * longest)
@@ -233,17 +242,17 @@ def coarse_offset(problem: PoseProblem) -> float:
     best = int(np.argmin(misfits))
     near = float(trials[best]) if misfits[best] < COARSE_OFFSET_MISFIT * still else 0.0
     far = np.arange(COARSE_S, longest if reach == COARSE_S else 0.0, FAR_STEP_S)
-    return _most_alike(problem, near, [(float(o), 0.0) for o in (*-far, *far)])[0]
+    return _most_alike(problem, near, [(float(o), 0.0) for o in (*-far, *far)], ALIKE)[0]
 
 
-def coarse_rate(problem: PoseProblem, offset: float) -> tuple[float, float]:
-    """Return offset, s, and rate (parts of one) of clocks that run apart by far in a session."""
+def _coarse_rate(problem: PoseProblem, offset: float) -> tuple[float, float]:
+    """Offset, s, and rate (parts of one) of clocks that run apart by far in a session."""
     moved = 0.5 * problem.setting.duration  # by a rate of one, at the session's ends
-    if problem.path.is_at_rest or FASTEST * moved < FAR_STEP_S:
-        return offset, 0.0
-    rates = np.arange(-FASTEST, FASTEST, FAR_STEP_S / moved)
+    steps = np.arange(1, FASTEST * moved / FAR_STEP_S)
+    rates = np.r_[-steps[::-1], 0, steps] * FAR_STEP_S / moved
     near = offset + np.arange(-COARSE_S, COARSE_S, FAR_STEP_S)
-    return _most_alike(problem, offset, [(float(o), float(r)) for r in rates for o in near])
+    trials = [(float(o), float(r)) for r in rates for o in near]
+    return _most_alike(problem, offset, trials if steps.size else [], 1.0)
 
 
 def longest_recording(problem: PoseProblem) -> float:
@@ -254,9 +263,9 @@ def longest_recording(problem: PoseProblem) -> float:
 
 
 def _most_alike(
-    problem: PoseProblem, offset: float, trials: Sequence[tuple[float, float]]
+    problem: PoseProblem, offset: float, trials: Sequence[tuple[float, float]], enough: float
 ) -> tuple[float, float]:
-    """The offset, s, and rate, of some, at which motions are alike, if they are not as it is.
+    """The offset, s, and rate, of some, at which motions are more alike, if they are not enough.
 
     Ways and angles between two times are the same in all frames, but for lever arms.
     """
@@ -265,7 +274,7 @@ def _most_alike(
         later = np.searchsorted(poses.time, poses.time + HAND_S)
         rows = np.flatnonzero(later < poses.size)
         rows = rows[poses.time[later[rows]] - poses.time[rows] < 10 * HAND_S]
-        rows = rows[:: max(1, rows.size // COARSE_POSES)]
+        rows = rows[:: max(1, rows.size * len(problem.sensors) // COARSE_POSES)]
         ends = poses.time[rows], poses.time[later[rows]]
         turns = Rotation.from_quat(poses.quaternion)
         turned = (turns[rows].inv() * turns[later[rows]]).magnitude()
@@ -277,10 +286,11 @@ def _most_alike(
         return float(np.mean([_alike(problem.path, *pair, trial, middle) for pair in pairs]))
 
     here = alike((offset, 0.0))
-    if here > ALIKE or not trials:
+    if here > enough or not trials:
         return offset, 0.0
     best = max(trials, key=alike)
-    return best if alike(best) > max(ALIKE, here + UNLIKE) else (offset, 0.0)
+    is_more = alike(best) > max(ALIKE, 1 - UNLIKE * (1 - here))
+    return best if is_more else (offset, 0.0)
 
 
 def _alike(
@@ -289,13 +299,13 @@ def _alike(
 ) -> float:  # fmt: skip
     """The larger correlation of ways and of angles between two times with the reference's."""
     offset, rate = clock
-    one, other = (path.at(time - offset - rate * (time - middle)) for time in ends)
+    one, other = (path.fixed(time - offset - rate * (time - middle)) for time in ends)
     known = one[3] & other[3]
     if np.count_nonzero(known) < max(FEWEST_HAND_EYE_POSES + 13, LEAST_OVERLAP * known.size):
         return 0.0
     way = np.linalg.norm(one[0] - other[0], axis=1)[known]
-    cosine = (np.einsum('nij,nij->n', one[1][known], other[1][known]) - 1) / 2
-    angle = np.arccos(np.clip(cosine, -1, 1))
+    cosine = np.abs(np.sum(one[1][known] * other[1][known], axis=1))
+    angle = 2 * np.arccos(np.minimum(cosine, 1.0))
     return max(float(np.corrcoef(a, b)[0, 1]) if np.ptp(a) > 0 and np.ptp(b) > 0 else 0.0
                for a, b in ((way, moved[known]), (angle, turned[known])))  # fmt: skip
 
@@ -370,20 +380,21 @@ def _turn_of_turns(tracked: Array, optical: Array) -> Array:
     return np.asarray(solution)
 
 
+def times_by(clock: Sequence[PoseTerm], poses: PoseSequence) -> Array:
+    """Return the times, s, of poses on the reference's clock."""
+    time = poses.time
+    for term in clock:
+        time = term.effect.clock(term, poses.name, time)
+    return time
+
+
 def started(
-    problem: PoseProblem, offset: float, frame: Array | None = None, rate: float = 0.0
+    problem: PoseProblem, clock: Sequence[PoseTerm], frame: Array | None = None
 ) -> list[PoseTerm]:
     """Return both frames and a clock to start from; a known registration is the identity."""
     pairs = []
-    clock = [PoseTerm(effect_with(Role.OFFSET), {}, np.array([offset]))]
-    if rate:
-        clock += [t.with_theta(np.array([1e3 * rate]))
-                  for t in effect_with(Role.RATE).sites(problem.setting)]  # fmt: skip
     for poses in problem.sensors:
-        time = poses.time
-        for term in clock:
-            time = term.effect.clock(term, poses.name, time)
-        place, turn, _, known = problem.path.at(time)
+        place, turn, _, known = problem.path.at(times_by(clock, poses))
         pairs.append((poses.position[known], poses.rotation[known], place[known], turn[known]))
     terms: list[PoseTerm] = []
     rotation = np.eye(3) if frame is None else frame
@@ -408,19 +419,17 @@ def _middle(turns: Rotation) -> Array:
     return np.asarray(mean.as_matrix())
 
 
-def first_fit(problem: PoseProblem, offset: float, is_one_frame: bool) -> PoseFit:
+def first_fit(problem: PoseProblem, clock: Sequence[PoseTerm], is_one_frame: bool) -> PoseFit:
     """Return the best robust fit of the two frames from several starts."""
-    offset, rate = coarse_rate(problem, offset)
-    frames = [None] if is_one_frame else _frames(problem, offset, rate)
-    fits = [robust_fit(problem, started(problem, offset, frame, rate)) for frame in frames]
+    frames = [None] if is_one_frame else _frames(problem, clock)
+    fits = [robust_fit(problem, started(problem, clock, frame)) for frame in frames]
     return min(fits, key=first_cost)
 
 
-def _frames(problem: PoseProblem, offset: float, rate: float) -> list[Array]:
+def _frames(problem: PoseProblem, clock: Sequence[PoseTerm]) -> list[Array]:
     """The rotations to start from, by places and by turns."""
     poses = max(problem.sensors, key=lambda p: p.size)
-    late = offset + rate * (poses.time - problem.setting.start - 0.5 * problem.setting.duration)
-    place, turn, _, known = problem.path.at(poses.time - late)
+    place, turn, _, known = problem.path.at(times_by(clock, poses))
     turned = Rotation.from_matrix(turn[known]).as_quat()
     return [
         frames_from_places(poses.position[known], place[known]),
@@ -475,7 +484,7 @@ def untangled(session: PoseSession) -> tuple[PoseSession, list[EffectRecord]]:
     early = problem.in_blocks(blocks[: round(EARLY * blocks.size)])
     if len(problem.sensors) < 2 or session.reference is None:
         return session, []
-    fit = first_fit(early, coarse_offset(early), False)
+    fit = first_fit(early, coarse_clock(early), False)
     return put_back(session, swapped_spans(problem, fit))
 
 

@@ -20,7 +20,7 @@ from anser_ros.apps.poses.hand_eye import one_clock
 from anser_ros.apps.poses.problem import PoseNoise
 from anser_ros.apps.poses.search import doubt, with_noise
 from anser_ros.apps.poses.sequence import OpticalPath, PoseSession, sequence_of
-from anser_ros.apps.poses.start import coarse_offset, first_fit, pose_problem, started
+from anser_ros.apps.poses.start import coarse_clock, first_fit, pose_problem, started
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
@@ -76,7 +76,7 @@ def test_at_rest_nothing_depends_on_speed():
     session = World(7, sensors=1).session()
     problem = pose_problem(session)
     still = replace(problem, path=replace(problem.path, is_at_rest=True))
-    assert 'speed' not in depends_on(still.state(started(still, 0.0)))
+    assert 'speed' not in depends_on(still.state(started(still, coarse_clock(still))))
 
 
 def test_a_short_motion_with_little_error_gives_no_lever_arm():
@@ -84,7 +84,7 @@ def test_a_short_motion_with_little_error_gives_no_lever_arm():
     world.noise_m, slow = 5e-5, world._turn
     world._turn = lambda time: 0.06 * slow(time)
     problem = pose_problem(world.session())
-    fit = with_noise(first_fit(problem, coarse_offset(problem), False))
+    fit = with_noise(first_fit(problem, coarse_clock(problem), False))
     assert not is_lever_determined(fit.state.parts[0], 0.0).any()
 
 
@@ -233,7 +233,7 @@ def test_an_offset_of_all_sensors_that_is_less_than_known_is_doubted():
         world = World(4, duration=15.0, sensors=1)
         world.offset = offset
         problem = pose_problem(world.session())
-        fit = with_noise(first_fit(problem, coarse_offset(problem), False))
+        fit = with_noise(first_fit(problem, coarse_clock(problem), False))
         index = next(i for i, t in enumerate(fit.terms) if t.role is Role.OFFSET)
         assert bool(doubt(fit, index)) == is_doubted
 
@@ -257,7 +257,7 @@ def test_recordings_at_rest_one_after_the_other_are_compared_whole():
     problem = pose_problem(session)
     assert problem.path.is_at_rest
     assert problem.path.at(problem.sensors[0].time)[3].all()
-    fit = with_noise(first_fit(problem, 0.0, False))
+    fit = with_noise(first_fit(problem, coarse_clock(problem), False))
     assert fit.state.rms()[0] < 1e-3
 
 
