@@ -194,6 +194,13 @@ def test_a_tool_moved_by_hand_calibrates_without_a_camera(setup):
     assert {'sensor_gain_spread', 'sensor_axis_spread', 'sensor_place_spread'} <= names
 
 
+def test_two_bodies_whose_coils_have_the_same_channel_are_refused(setup):
+    session = World(setup, 6).waved(2.0)
+    other = replace(session, tools=tuple(replace(m, body='probe') for m in session.tools))
+    with pytest.raises(FitError, match='channel 0 is a coil of tool and of probe'):
+        calibrate_sessions([session, other], Options(estimate=KINDS))
+
+
 @pytest.mark.parametrize(('emitters', 'seed'), [([1, 3, 6], 12), ([0, 1, 2, 4, 5, 7], 13)])
 def test_a_board_of_few_emitters_calibrates_by_whole_tools(setup, emitters, seed):
     coils = tuple(setup.emitter.coils[k] for k in emitters)

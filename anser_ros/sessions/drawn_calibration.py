@@ -94,7 +94,15 @@ def fit_to_drawing(
 
     Raises `FitError` with what was typed wrongly, or when unknown poses leave no such board.
     """
-    found, typed = [], []
+    found, typed, body_of = [], [], dict[int, str]()
+    for channel, body in (
+        (c, m.body) for s in sessions for m in s.tools for c in m.sensors.channel
+    ):
+        if body_of.setdefault(int(channel), body) != body:
+            raise FitError(
+                f'channel {channel} is a coil of {body_of[int(channel)]} and of {body}: what is '
+                'learnt of a coil is kept by its channel, so calibrate with one of them'
+            )
     for whole in sessions:
         session = replace(whole, tools=tuple(evenly(whole.tools)), reference=None)
         starts = _drawn_poses(session, generator.nominal)
