@@ -314,7 +314,8 @@ class Calibration:
     # root mean square of the magnitude of the nominal model's residual on the same readings, T
     nominal_rmse_t: float | None = None
     candidates: tuple[LayoutCandidate, ...] = ()  # all layouts that were compared
-    contradictions: tuple[str, ...] = ()  # a line for everything of which two sessions disagree
+    # a line for everything of which two sessions disagree, or that a plate's places contradict
+    contradictions: tuple[str, ...] = ()
     undetermined: tuple[str, ...] = ()  # lines on what the readings cannot determine
     # of each emitter how it differs from its drawing, where that was found, as plain data
     emitters: Sequence[Mapping[str, Any]] = ()
@@ -363,7 +364,7 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
     inside, span = calibration.residuals, calibration.residuals.span_t
     each = zip(calibration.model.emitters, inside.each_t, held_out.error.T, strict=True)
     nominal = calibration.nominal_rmse_t
-    off = [dict(own) for own in calibration.emitters] or [{}] * len(calibration.model.emitters)
+    drawn = calibration.emitters or [{}] * len(calibration.model.emitters)
     return {
         'schema': 'anser_calibration/1',
         'n_measurements': calibration.n_measurements,
@@ -379,7 +380,7 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
                 'heldout_flux_rmse_t': rms(outside),
                 **own,
             }
-            for (name, fitted, outside), own in zip(each, off, strict=True)
+            for (name, fitted, outside), own in zip(each, drawn, strict=True)
         ],
         'marginal': {
             'noise_t': held_out.noise_t,

@@ -94,15 +94,8 @@ def fit_to_drawing(
 
     Raises `FitError` with what was typed wrongly, or when unknown poses leave no such board.
     """
-    found, typed, body_of = [], [], dict[int, str]()
-    for channel, body in (
-        (c, m.body) for s in sessions for m in s.tools for c in m.sensors.channel
-    ):
-        if body_of.setdefault(int(channel), body) != body:
-            raise FitError(
-                f'channel {channel} is a coil of {body_of[int(channel)]} and of {body}: what is '
-                'learnt of a coil is kept by its channel, so calibrate with one of them'
-            )
+    _check_channels([tool for session in sessions for tool in session.tools])
+    found, typed = [], []
     for whole in sessions:
         session = replace(whole, tools=tuple(evenly(whole.tools)), reference=None)
         starts = _drawn_poses(session, generator.nominal)
@@ -130,6 +123,19 @@ def fit_to_drawing(
         )
     names = [Path(session.path).name for session in sessions for _ in session.tools]
     return with_provenance(_calibration(fit, found, typed, generator, options), names)
+
+
+def _check_channels(tools: Sequence[Measurements]) -> None:
+    """Raise `FitError` where bodies share a channel, by which a model knows its coils."""
+    body_of: dict[int, str] = {}
+    for tool in tools:
+        for channel in tool.sensors.channel.tolist():
+            known = body_of.setdefault(channel, tool.body)
+            if known != tool.body:
+                raise FitError(
+                    f'channel {channel} is a coil of {known} and of {tool.body}: what is learnt '
+                    'of a coil is kept by its channel, so calibrate with one of them'
+                )
 
 
 def _drawn_poses(session: Session, nominal: FieldModel | None) -> list[Measurements]:

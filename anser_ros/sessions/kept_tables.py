@@ -1,5 +1,6 @@
 """Keeps tables of refits, seconds of work, on disk while model, setup and code are the same."""
 
+import functools
 import os
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -75,9 +76,7 @@ class KeptTables:
         self._given = setup, model, references
         self._ahead = ahead or ReadAhead(None, None)
         places = [getattr(references, f.name) for f in fields(references)]
-        # What changes with the code that computes tables, in whichever copy of the package.
-        code = [(str(f.relative_to(PACKAGE)), f.read_text('utf-8')) for f in PACKAGE.rglob('*.py')]
-        made_by, stated = [np.__version__, *sorted(code)], dict(setup.stated)
+        made_by, stated = [np.__version__, _code()], dict(setup.stated)
         key = fingerprint_of(
             [made_by, setup.identity.board, setup.volume, stated, model.fingerprint, places]
         )
@@ -101,6 +100,14 @@ class KeptTables:
         files = sorted(self._folder.glob(f'{TABLES}*'), key=used_s, reverse=True)
         for old in files[MOST_TABLES:]:
             old.unlink(missing_ok=True)
+
+
+@functools.cache
+def _code() -> str:
+    """The fingerprint of the code that computes tables, the same in every copy of the package."""
+    return fingerprint_of(
+        {str(f.relative_to(PACKAGE)): f.read_text('utf-8') for f in PACKAGE.rglob('*.py')}
+    )
 
 
 def _tables_name(model: FieldModel) -> str:
