@@ -1,19 +1,17 @@
-"""Write a setup document by questions or options, check it, and draw it."""
+"""Write a setup document by options and tables, check it, and draw it."""
 
 import argparse
 import itertools
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import yaml
 
 from anser_ros.cli import output
 from anser_ros.cli.board_figures import setup_figure
-from anser_ros.errors import AnserError, ParameterError
+from anser_ros.errors import ParameterError
 from anser_ros.sessions.nominal_board import board_of
 from anser_ros.settings import sections_of
 from anser_ros.wire.setup import FIELD_GENERATOR, SCHEMA, Setup, parse_setup
@@ -29,7 +27,7 @@ GEOMETRY = {
     'rectangular_loop': ('side_x_m', 'side_y_m', 'turns', 'current_a'),
     'circular_loop': ('radius_m', 'turns', 'current_a'),
 }
-"""What is asked of the coils of a kind of board."""
+"""What is stated of the coils of a kind of board."""
 WHOLE = ('turns', 'layers')
 DIRECTIONS = {
     f'{sign}{name}': [factor * float(axis == name) for axis in 'xyz']
@@ -75,8 +73,6 @@ def metres(values: Sequence[float]) -> list[float]:
 
 def emitter_of(kind: str, geometry: Mapping[str, float], coils: list[Document]) -> Document:
     """Return the section of a board; its values are checked with the whole document."""
-    if kind not in GEOMETRY:
-        raise ParameterError(f'no board {kind}; there are: {", ".join([ANSER, *GEOMETRY])}')
     values = {k: int(v) if k in WHOLE and v == int(v) else v for k, v in geometry.items()}
     return {'kind': kind, **values, 'coils': coils}
 
@@ -95,17 +91,12 @@ def coil_of(name: str, text: str) -> Document:
     }  # fmt: skip
 
 
-def sensor_of(text: str, body: str = '') -> Document:
-    """Return a sensor of ``channel, name, body, x, y, z, axis[, length]``, mm; see `axis_of`.
-
-    If a ``body`` is given, the text does not contain one.
-    """
+def sensor_of(text: str) -> Document:
+    """Return a sensor of ``channel, name, body, x, y, z, axis[, length]``, mm; see `axis_of`."""
     cells = [cell.strip() for cell in text.split(',')]
-    if body:
-        cells.insert(2, body)
     if len(cells) not in (7, 8):
-        names = [name for name in SENSOR_COLUMNS if not body or name != 'body']
-        raise ParameterError(f'a sensor takes {",".join(names)}[,length_mm], got {text.strip()!r}')
+        names = ','.join(SENSOR_COLUMNS)
+        raise ParameterError(f'a sensor takes {names}[,length_mm], got {text.strip()!r}')
     what = f'sensor {cells[1]}'
     channel = number_of(cells[0], f'{what}: channel')
     if channel != int(channel):
@@ -214,134 +205,6 @@ def advice_on(setup: Setup) -> list[str]:
     return found
 
 
-Answer = TypeVar('Answer')
-ONE_TOOL_COIL = {'channel': 0, 'name': 'tool/0', 'body': 'tool', 'position_m': [0, 0, 0],
-                 'axis': [0, 0, 1]}  # fmt: skip
-"""Stands for the sensors while a board is checked before there are any."""
-
-
-class Questions:
-    """The questions in their order, of which each is asked until its answer can be read.
-
-    ``ask`` gives the answer to a question and raises `EOFError` where there is none; ``say`` shows
-    a line.
-    """
-
-    def __init__(self, ask: Callable[[str], str], say: Callable[[str], object]) -> None:
-        self._put, self._say = ask, say
-        self._sensors: list[Document] = []
-
-    def document(self) -> Document:
-        """Ask for board, tools, reference coils, rate and volume."""
-        self._say(
-            'Lengths are in mm, in the frame of the board: origin at its centre, z up to the '
-            'patient.'
-        )
-        self._say('An empty answer accepts the value in [brackets].')
-        self._emitter = self._board()
-        self._say(
-            'Now the tools: coils fixed to a body that moves, places and axes in its own frame.'
-        )
-        while True:
-            body = self._ask('name of a tool, or empty if there are no more', str)
-            if body:
-                self._coils(body)
-            elif self._sensors:
-                break
-            else:
-                self._say('  at least one tool is needed')
-        self._say(
-            'Reference coils are fixed in the frame of the board; with them the model follows '
-            'metal.'
-        )
-        self._coils(FIELD_GENERATOR)
-        rate = self._ask('flux windows a second [50]', lambda t: number_of(t or '50', 'the rate'))
-        volume = self._ask(
-            'corners of the tracked volume, x y z x y z [above the board, by its size]',
-            lambda t: numbers_of(t, 6, 'the volume') if t else None,
-        )
-        return document_of(self._emitter, self._sensors, rate, volume)
-
-    def _ask(self, question: str, read: Callable[[str], Answer]) -> Answer:
-        while True:
-            try:
-                text = self._put(f'{question}: ').strip()
-            except EOFError as error:
-                raise ParameterError(f'no answer to: {question}') from error
-            try:
-                return read(text)
-            except (AnserError, OSError) as error:
-                self._say(f'  {error}')
-
-    def _board(self) -> Document:
-        kinds = [ANSER, *GEOMETRY]
-
-        def kind_of(text: str) -> str:
-            if (text or ANSER) not in kinds:
-                raise ParameterError(f'there are: {", ".join(kinds)}')
-            return text or ANSER
-
-        kind = self._ask(f'board: {", ".join(kinds)} [{ANSER}]', kind_of)
-        if kind == ANSER:
-            return anser_emitter()
-        while True:
-            geometry = {
-                key: self._ask(f'{key} (SI units)', partial(number_of, what=key))
-                for key in GEOMETRY[kind]
-            }
-            words = 'x, y, z, turn about z in degrees, tone in Hz'
-            coils = [
-                self._ask(f'coil{rank}: {words}', partial(coil_of, f'coil{rank}'))
-                for rank in range(self._ask('number of emitter coils [8]', _count(8, 1)))
-            ]
-            emitter = emitter_of(kind, geometry, coils)
-            try:
-                text_of(document_of(emitter, [ONE_TOOL_COIL]))
-            except AnserError as error:
-                self._say(f'  {error}; try again')
-                continue
-            return emitter
-
-    def _coils(self, body: str) -> None:
-        """Take the sensors of one body: typed one after the other, or all of a CSV file."""
-        is_board = body == FIELD_GENERATOR
-        what, usual = ('reference coils', 0) if is_board else (f'coils on {body}', 1)
-        names = tuple(name for name in SENSOR_COLUMNS if name != 'body')
-        columns = ','.join(names)
-
-        def count_or_file(text: str) -> int:
-            if Path(text).suffix != '.csv':
-                return _count(usual, usual)(text)
-            self._add([sensor_of(row, body) for row in rows_of(Path(text), names)])
-            return 0
-
-        count = self._ask(
-            f'number of {what}, or a .csv file of {columns} [{usual}]', count_or_file
-        )
-        for rank in range(count):
-            self._ask(
-                f'{what}, {rank + 1} of {count}: {columns}',
-                lambda text: self._add([sensor_of(text, body)]),
-            )
-
-    def _add(self, found: list[Document]) -> None:
-        """Keep sensors with which the document breaks no rule; it raises where it does."""
-        every = [*self._sensors, *found]
-        if found:
-            text_of(document_of(self._emitter, every))
-        self._sensors = every
-
-
-def _count(usual: int, least: int) -> Callable[[str], int]:
-    def read(text: str) -> int:
-        value = number_of(text or str(usual), 'the number')
-        if value != int(value) or value < least:
-            raise ParameterError(f'must be a whole number of at least {least}, got {text}')
-        return int(value)
-
-    return read
-
-
 RESULT = 'anser_setup_result/1'
 DOCUMENT, PICTURE = 'setup.yaml', 'setup.png'
 
@@ -379,27 +242,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output.add_json(parser, 'the written files and the advice as JSON')
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command; the exit code."""
-    parts = [args.board, args.geometry, args.coil, args.coils, args.sensor, args.sensors]
+def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
+    """Draw a document, a new one or one that is there; nothing is written where that fails."""
     output.make_folder(args.out)
-    if args.document is None and (args.out / DOCUMENT).exists():
-        raise ParameterError(
-            f'{args.out / DOCUMENT} is there already, perhaps with tips and changes by hand: give '
-            f'another folder, or remove it'
-        )
     if args.document is not None:
+        parts = args.board, args.geometry, args.coil, args.coils, args.sensor, args.sensors
         if any(parts) or args.volume or args.stated:
             raise ParameterError(
                 'a setup document is complete: these options are for a new one only'
             )
-        text = read_config(args.document)
-        setup = parse_setup(text)
-    elif any(parts):
-        text, setup = text_of(_document(args))
+        own, setup = {}, parse_setup(read_config(args.document))
+    elif (args.out / DOCUMENT).exists():
+        raise ParameterError(
+            f'{args.out / DOCUMENT} is there already, perhaps with tips and changes by hand: give '
+            f'another folder, or remove it'
+        )
     else:
-        text, setup = text_of(Questions(_ask, _say).document())
-    return _write(args, text, setup)
+        text, setup = text_of(_document(args))
+        own = {DOCUMENT: text}
+        board_of(setup)
+    advice = advice_on(setup)
+    written = output.write_files(args.out, {**own, PICTURE: setup_figure(setup)})
+    words = (
+        f'{len(setup.emitter.coils)} emitter coils, {len(setup.reference_sensors)} reference '
+        f'coils, tools: {", ".join(setup.bodies) or "none"}'
+    )
+    document = {'schema': RESULT, 'files': list(map(str, written)), 'advice': advice}
+    return output.Result(document, tuple(advice), (words,), written)
 
 
 def _document(args: argparse.Namespace) -> Document:
@@ -423,34 +292,3 @@ def _document(args: argparse.Namespace) -> Document:
     volume = None if args.volume is None else numbers_of(args.volume, 6, '--volume')
     sensors = [sensor_of(row) for row in rows]
     return document_of(emitter, sensors, args.rate, volume, output.stated_values(args))
-
-
-def _write(args: argparse.Namespace, text: str, setup: Setup) -> int:
-    """Write document and picture; nothing is written of a board that cannot be drawn."""
-    if args.document is None:
-        board_of(setup)
-    advice = advice_on(setup)
-    own = {} if args.document else {DOCUMENT: text}
-    written = output.write_files(args.out, {**own, PICTURE: setup_figure(setup)})
-    words = (
-        f'{len(setup.emitter.coils)} emitter coils, {len(setup.reference_sensors)} reference '
-        f'coils, tools: {", ".join(setup.bodies) or "none"}'
-    )
-    document = {'schema': RESULT, 'files': list(map(str, written)), 'advice': advice}
-    output.say(
-        'setup', output.Result(document, tuple(advice), (words,), written), as_json=args.json
-    )
-    return 0
-
-
-def _ask(question: str) -> str:
-    """As `input`, with the question on stderr: stdout is for what comes out."""
-    print(question, end='', file=sys.stderr, flush=True)
-    line = sys.stdin.readline()
-    if not line:
-        raise EOFError
-    return line
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr)
