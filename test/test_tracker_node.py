@@ -15,10 +15,8 @@ from anser_ros.errors import ParameterError
 from anser_ros.field.model import EffectRecord
 from anser_ros.nodes import pose_output
 from anser_ros.nodes.field_model import FieldModelNode
-from anser_ros.nodes.tracker import TrackerNode, TrackerParameters, settings_of
+from anser_ros.nodes.tracker import TrackerNode
 from anser_ros.physics.rotations import rotation_of_quaternion
-from anser_ros.physics.volume import TrackedVolume
-from anser_ros.sessions.prepared import settings_for
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import save_model
 from anser_ros.wire.setup import dump_setup
@@ -213,7 +211,7 @@ def test_where_the_board_is_is_stated(ros, tmp_path, monkeypatch):
         TrackerNode(parameter_overrides=given(parent_frame='base'))
 
 
-def test_the_volume_of_the_setup_holds_unless_a_parameter_says_another(tracker):
+def test_no_pose_is_given_outside_the_volume_of_the_setup(tracker):
     rng, node = np.random.default_rng(8), tracker.node
     box = ((-0.1, -0.1, 0.2), (0.1, 0.1, 0.3))
     tracker.say_setup(dump_setup(replace(setup_of(SENSORS, reference_specs()), volume=box)))
@@ -223,11 +221,6 @@ def test_the_volume_of_the_setup_holds_unless_a_parameter_says_another(tracker):
     wait_frame(tracker, 1)
     node.publish_diagnostics()
     tracker.spin_until(lambda: tracker.state('anser/tracker: tool_a') == 'outside_volume')
-    low, high = (-0.1, -0.1, 0.05), (0.1, 0.1, 0.3)
-    stated = settings_of(TrackerParameters(volume_low_m=low, volume_high_m=high))
-    assert settings_for(node._setup, stated).box == TrackedVolume(low, high)
-    with pytest.raises(ParameterError, match='volume_high_m: three numbers'):
-        settings_of(TrackerParameters(volume_low_m=low))
 
 
 def test_what_acquisition_measures_meanwhile_changes_settings_only(tracker):

@@ -23,7 +23,7 @@ from anser_ros.nodes.runtime.parameters import optical_parameter, parameter, pre
 from anser_ros.nodes.runtime.process import main
 from anser_ros.physics.rotations import quaternion_of_rotation
 from anser_ros.simulation import line, world
-from anser_ros.simulation.control_unit import BLOCK_SAMPLES, ControlUnit, FrontEnd, Piece
+from anser_ros.simulation.control_unit import ControlUnit, FrontEnd, Piece
 from anser_ros.simulation.effects import NONE as NO_EFFECT
 from anser_ros.simulation.effects import Drawn, draw
 from anser_ros.wire.channel_calibration import parse_channels
@@ -35,6 +35,8 @@ STRETCH_S = 0.005
 """Stretch of samples that is made at a time, s: it bounds how unevenly they are sent."""
 LONGEST_LAG_S = 0.25
 """Lag behind the clock, s, beyond which samples are left out instead of made up for."""
+OPTICAL_RATE_HZ = 60.0
+"""Poses a second of the optical truth, as usual for optical trackers."""
 
 
 @dataclass(frozen=True)
@@ -55,20 +57,8 @@ class CuSimulatorParameters:
     sample_rate_hz: float = parameter(
         FrontEnd.sample_rate_hz, 'samples a second and channel', within=(16e3, 100e3)
     )
-    block_samples: int = parameter(BLOCK_SAMPLES, 'sampling instants a block', within=(1, 600))
-    noise_codes: float = parameter(
-        FrontEnd.noise_codes, 'white noise before the converter, codes rms', within=(0.0, 1000.0)
-    )
-    current_drift: float = parameter(
-        FrontEnd.current_drift,
-        'share by which the currents fall as the coils warm up',
-        within=(0.0, 0.5),
-    )
     metal: bool = parameter(True, 'whether a steel disc comes and goes')
     metal_radius_m: float = parameter(0.06, 'of the disc, m', within=(0.005, 0.3))
-    metal_near_m: tuple[float, ...] = parameter(
-        (0.05, -0.03, -0.08), 'nearest position of the disc in fg, m', within=(-2.0, 2.0)
-    )
     metal_start_s: float = parameter(
         12.0,
         'when the disc starts to move, s after the first start of the stream',
@@ -80,9 +70,6 @@ class CuSimulatorParameters:
     metal_stay_s: float = parameter(6.0, 'time that it stays near, s', within=(0.0, math.inf))
     metal_period_s: float = parameter(
         30.0, 'period of its visits; 0 for a single one, s', within=(0.0, math.inf)
-    )
-    optical_rate_hz: float = parameter(
-        60.0, 'poses a second of the optical truth', within=(1.0, 200.0)
     )
     optical_noise_m: float = parameter(
         0.0, 'jitter of the optical position, m rms an axis', within=(0.0, 0.01)
@@ -134,16 +121,9 @@ class CuSimulator(AnserNode):
         paths = world.tool_paths(setup.bodies, table.path_phase_rad)
         self._world = world.World(real, world.board_source(made), paths=paths, metal=self._metal)
         self._world.flux(0.0)  # loads the kernels now, not while samples are due
-        front = FrontEnd(
-            table.sample_rate_hz, noise_codes=table.noise_codes, current_drift=table.current_drift
-        )
+        front = FrontEnd(table.sample_rate_hz)
         self._unit = ControlUnit(
-            self._world,
-            channels,
-            front,
-            block_samples=table.block_samples,
-            effects=drawn.effects,
-            seed=table.seed,
+            self._world, channels, front, effects=drawn.effects, seed=table.seed
         )
         self._least_late_ns = math.inf
         self._rng = np.random.default_rng(table.seed + 1)
@@ -160,7 +140,7 @@ class CuSimulator(AnserNode):
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name='control_unit')
         self._thread.start()
-        self.create_timer(1 / table.optical_rate_hz, self._publish_truth, clock=self.steady_clock)
+        self.create_timer(1 / OPTICAL_RATE_HZ, self._publish_truth, clock=self.steady_clock)
         self.get_logger().info(f'control unit at {table.link}')
 
     # Device thread ------------------------------------------------------------------------
@@ -275,12 +255,7 @@ def _metal(table: CuSimulatorParameters, begin_s: Callable[[], float]) -> list[w
     """The disc, on a path that begins when `begin_s` says."""
     if not table.metal:
         return []
-    if len(table.metal_near_m) != 3:
-        raise ParameterError(f'metal_near_m needs 3 numbers, got {len(table.metal_near_m)}')
-    x, y, z = table.metal_near_m
     path = world.Approach(
-        far_m=(x, y, z - 0.52),
-        near_m=(x, y, z),
         start_s=table.metal_start_s,
         travel_s=table.metal_travel_s,
         stay_s=table.metal_stay_s,

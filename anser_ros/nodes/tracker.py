@@ -18,8 +18,9 @@ from std_msgs.msg import String
 
 from anser_ros.chain.frame import AnsweredFrames, FrameReadings
 from anser_ros.chain.tracking_half import TrackingHalf
-from anser_ros.errors import AnserError, ParameterError
+from anser_ros.errors import AnserError
 from anser_ros.field.model import FieldModel
+from anser_ros.fingerprint import fingerprint_of
 from anser_ros.nodes.pose_output import (
     PoseTopic,
     state_board,
@@ -39,9 +40,7 @@ from anser_ros.nodes.runtime.parameters import (
 from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.streams import one_source
 from anser_ros.nodes.streams.clouds import GivenModel, read_frame, readings_of
-from anser_ros.nodes.streams.readiness import digest_of
 from anser_ros.nodes.tracker_models import ModelIntake, ModelReader
-from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import OK, TWO_SOURCES, Withheld
 from anser_ros.sessions.prepared import settings_for
 from anser_ros.sessions.session import sensor_table
@@ -105,23 +104,6 @@ class TrackerParameters:
         within=(1e-5, 1.0),
         live=True,
     )
-    volume_low_m: tuple[float, ...] = parameter(
-        (), "lower corner of the tracked volume, m; empty: the setup's volume"
-    )
-    volume_high_m: tuple[float, ...] = parameter(
-        (), "upper corner of the tracked volume, m; empty: the setup's volume"
-    )
-    grid_spacing_m: float = parameter(
-        TrackerSettings.grid_spacing_m,
-        'spacing of the cold start at 0.1 m height, m',
-        within=(0.005, 0.2),
-    )
-    warm_age_s: float = parameter(
-        TrackerSettings.warm_age_s,
-        'largest age of a good pose that a solve starts from, s',
-        within=(0.01, 60.0),
-        live=True,
-    )
     stale_after_s: float = parameter(
         STALE_AFTER_S,
         'time without fluxes after which a sensor is stale, s',
@@ -138,20 +120,8 @@ class TrackerParameters:
 
 
 def settings_of(table: TrackerParameters) -> TrackerSettings:
-    """Return settings of the core.
-
-    Raises `ParameterError` when a corner of the volume is not three numbers, or only one of the
-    two is given, and `TrackingError` when the corners make no box.
-    """
-    low, high = table.volume_low_m, table.volume_high_m
-    volume = None
-    if low or high:
-        for name in ('volume_low_m', 'volume_high_m'):
-            if len(getattr(table, name)) != 3:
-                raise ParameterError(f'parameter {name}: three numbers needed')
-        volume = TrackedVolume((low[0], low[1], low[2]), (high[0], high[1], high[2]))
-    names = ('adaptive', 'grid_spacing_m', 'gate', 'max_sigma_m', 'warm_age_s')
-    return TrackerSettings(volume=volume, **{name: getattr(table, name) for name in names})
+    """Return settings of the core."""
+    return TrackerSettings(adaptive=table.adaptive, gate=table.gate, max_sigma_m=table.max_sigma_m)
 
 
 def tips_of_file(path: str) -> dict[str, TipSpec]:
@@ -494,7 +464,7 @@ class TrackerNode(AnserNode):
         if half is None or half.tracker.model is None or lacks_model or lacks_error:
             return ''
         is_matched = all(topic.is_matched(self) for topic in self._topics.values())
-        return digest_of(self._setup_text) if is_matched else ''
+        return fingerprint_of(self._setup_text) if is_matched else ''
 
     def part_statuses(self) -> list[Status]:
         """Return a line for every sensor and body."""
