@@ -7,7 +7,6 @@ poses (``ready_for``), how many those are (``pose_listeners``), and that its mod
 """
 
 import contextlib
-import hashlib
 import math
 import time
 from collections.abc import Mapping
@@ -18,6 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 
 from anser_ros import extensions
 from anser_ros.errors import SetupError
+from anser_ros.fingerprint import fingerprint_of
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import statuses_in
 from anser_ros.nodes.runtime.node import AnserNode
@@ -35,11 +35,6 @@ PATIENCE_S = 8.0
 """The same while somebody is missed who may still be starting."""
 
 
-def digest_of(setup_text: str) -> str:
-    """Return eight hexadecimal digits that distinguish setups."""
-    return hashlib.blake2b(setup_text.encode(), digest_size=4).hexdigest()
-
-
 class Readiness:
     """Watches the graph and ``/diagnostics`` from a node whose executor spins elsewhere.
 
@@ -50,7 +45,7 @@ class Readiness:
     def __init__(self, node: AnserNode, fluxes: list[Any], setup_text: str) -> None:
         self._node, self._fluxes = node, fluxes
         self._home = node.get_namespace().rstrip('/')
-        self._digest = digest_of(setup_text)
+        self._digest = fingerprint_of(setup_text)
         names: list[str] = []
         with contextlib.suppress(SetupError):  # who listens may make more of it
             setup = parse_setup(setup_text)
