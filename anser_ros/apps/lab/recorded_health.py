@@ -1,8 +1,7 @@
-"""What nodes published and reported in a recorded session: errors of poses, states, losses."""
+"""What nodes published and reported in a recorded session: errors of poses, and states."""
 
 import os
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -63,20 +62,6 @@ def _compared(
 
 
 TOPIC = '/diagnostics'
-WARN = 1
-"""Level of a warning in diagnostic_msgs/DiagnosticStatus."""
-BUSY = {
-    'lags': 'stretches of samples that the simulated unit could not make in time',
-    'dropped_blocks': 'blocks that the simulated unit could not send',
-    'overrun_blocks': 'blocks that the host was too slow to take',
-    'gap_blocks': 'blocks missing in the stream',
-    'windows_skipped': 'windows that the host was too slow for',
-    'windows_lost': 'windows without enough samples',
-    'windows_dropped_samples': 'windows with holes',
-    'frames_skipped': 'frames that the tracker was too slow for',
-    'lost_messages': 'messages that the recorder lost',
-}
-"""Counters that rise when a machine cannot keep up, and what they count."""
 
 
 def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
@@ -84,22 +69,15 @@ def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
 
     A bag without diagnostics, or one that cannot be read yet, gives an empty mapping.
     """
+    decoder, words = MessageDecoder(), {}
     try:
-        return {
-            status.name: {item.key: item.value for item in status.values}
-            for _, status in _statuses(path)
-        }
+        for raw in iter_messages(path, Salvage()):
+            if raw.topic == TOPIC:
+                for status in decoder.decode(raw).status:
+                    words[status.name] = {item.key: item.value for item in status.values}
     except BagError:
         return {}
-
-
-def _statuses(path: str | os.PathLike[str]) -> Iterator[tuple[int, Any]]:
-    """Every status of a recording with its log time, ns."""
-    decoder = MessageDecoder()
-    for raw in iter_messages(path, Salvage()):
-        if raw.topic == TOPIC:
-            for status in decoder.decode(raw).status:
-                yield raw.log_time_ns, status
+    return words
 
 
 def ok_share(words: Mapping[str, Mapping[str, str]], tracker: str) -> float:
@@ -115,33 +93,6 @@ def ok_share(words: Mapping[str, Mapping[str, str]], tracker: str) -> float:
             ok += counts.get(f'{FRAMES_IN}{OK}', 0)
             judged += sum(counts.values())
     return ok / judged if judged else 0.0
-
-
-def first_warnings(path: str | os.PathLike[str], part_of: str) -> dict[str, int]:
-    """Return when each part of a node first warned: log time, ns, by the part's name.
-
-    The statuses of a node's parts are named ``NODE: PART``. Raises `BagError` when the recording
-    cannot be read.
-    """
-    found: dict[str, int] = {}
-    for log_time_ns, status in _statuses(path):
-        node, _, name = status.name.partition(': ')
-        level = status.level  # a ``byte``, which some decoders give as bytes
-        level = level[0] if isinstance(level, bytes) else int(level)
-        if node == part_of and name and level == WARN:
-            found.setdefault(name, log_time_ns)
-    return found
-
-
-def overload(path: str | os.PathLike[str]) -> list[str]:
-    """Return signs, in words, that the machine was too busy for a recording; empty if complete."""
-    signs = []
-    for name, values in last_words(path).items():
-        for key, meaning in BUSY.items():
-            count = int(float(values.get(key) or 0))
-            if count:
-                signs.append(f'{name}: {count} {meaning}')
-    return signs
 
 
 def kept_share(session: Session) -> float:

@@ -20,14 +20,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from anser_ros.apps.lab.recorded_health import (
-    first_warnings,
-    kept_share,
-    last_words,
-    live_errors,
-    ok_share,
-    overload,
-)
+from anser_ros.apps.lab.recorded_health import kept_share, last_words, live_errors, ok_share
 from anser_ros.cli.demo import FROZEN_TRACKER, PATIENCE_S, in_namespace, simulated_unit
 from anser_ros.cli.demo import node_command as node
 from anser_ros.cli.main import check_packages
@@ -44,7 +37,6 @@ from anser_ros.sessions.starting_model import load_model, save_model
 from anser_ros.sessions.tracked_session import error_statistics
 from anser_ros.settings import Accuracy
 from anser_ros.simulation.effects import CATALOGUE, NONE, RANDOM
-from anser_ros.stamps import NANO
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.setup import dump_setup, parse_setup
 from anser_ros.wire.text_files import config_path, read_config
@@ -103,7 +95,6 @@ class Run:
     served: Path | None = None  # model whose poses are judged; no tracker in its chain without it
     baseline: Path | None = None  # clean recording; with it the model follows the references
     known: Path | None = None  # uncorrected model of the trackers beside; none without it
-    watched: Mapping[str, object] | None = None  # parameters of a watcher; none without them
 
 
 def record(run: Run) -> Path:
@@ -120,7 +111,7 @@ def record(run: Run) -> Path:
             commands = _commands(run, ports / 'cu')
             for name, command in commands.items():
                 supervisor.start(name, command)
-            ours = ('acquisition', 'recorder', 'tracker', 'watcher')
+            ours = ('acquisition', 'recorder', 'tracker')
             listeners = [f'{AFTER}/{name}' for name in ours if name in commands]
             listeners += [f'{apart}/tracker' for apart in _beside(run)]
             _wait(supervisor, run, lambda: _unready(bag, listeners))
@@ -147,8 +138,6 @@ def _commands(run: Run, port: Path) -> dict[str, list[str]]:
             follows = {'refit': True, 'baseline_file': run.baseline}
         commands['field_model'] = node('field_model', model_file=run.served, **follows)
         commands['tracker'] = node('tracker', model_file=run.served)
-    if run.watched is not None:
-        commands['watcher'] = node('watcher', **run.watched)
     for namespace, settings in _beside(run).items():
         name = f'tracker_{namespace.rsplit("/", 1)[-1]}'
         beside = in_namespace(namespace)
@@ -277,7 +266,7 @@ def second_run(session: Session, corrected: FieldModel, known: FieldModel) -> di
 
 
 def table(rounds: list[dict[str, Any]], console: Console) -> None:
-    """Print a line for every round, and the signs of an overloaded machine."""
+    """Print a line for every round."""
     out = Table(title='live error of the second run, on another path (simulated)')
     for heading in ('put in', 'found', 'verdict', 'parameters'):
         out.add_column(heading, overflow='fold')
@@ -298,14 +287,6 @@ def table(rounds: list[dict[str, Any]], console: Console) -> None:
             f'{100 * one["unexplained"]["fraction"]:.2g} %',
         )
     console.print(out)
-    for number, one in enumerate(rounds, 1):
-        for name, after_s in one['watcher_said_after_s'].items():
-            words = f'the watcher reported {name} {after_s:.0f} s after the first flux'
-            console.print(f'round {number}: {words}', highlight=False)
-    for number, one in enumerate(rounds, 1):
-        for name, signs in one['machine'].items():
-            text = '; '.join(signs)
-            console.print(f'round {number}, {name} run: {text}', style='yellow', highlight=False)
 
 
 def _number(value: float | None, scale: float, hidden: bool) -> str:
@@ -345,13 +326,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--duration', type=float, default=30.0, metavar='S', help='duration of the first run'
     )
-    parser.add_argument(
-        '--clean', type=float, default=CLEAN_S, metavar='S',
-        help='duration of the clean recording that is the baseline of the references; 0 for none',
-    )  # fmt: skip
-    parser.add_argument(
-        '--watch', action='store_true', help='also report what the watcher found in the first run'
-    )
     add_out(
         parser, 'a new folder with all results (%(default)s)', required=False,
         default=Path('recordings'), metavar='DIR',
@@ -382,10 +356,9 @@ def _run(args: argparse.Namespace, effects: list[str], seed: int) -> int:
     folder = make_new_folder(args.out, time.strftime('loop_%Y%m%d_%H%M%S'))
     say = Console(stderr=True, highlight=False)
     compile_kernels(say.print)
-    world, clean = make_world(folder), None
-    if args.clean:
-        say.print(f'a clean recording, {args.clean:g} s')
-        clean = record(Run(folder / 'clean', world.setup, args.clean))
+    world = make_world(folder)
+    say.print(f'a clean recording, {CLEAN_S:g} s')
+    clean = record(Run(folder / 'clean', world.setup, CLEAN_S))
     rounds: list[dict[str, Any]] = []
     document = {'schema': SCHEMA, 'data': 'simulated', 'folder': str(folder), 'rounds': rounds}
     for count, effect in enumerate(effects):
@@ -407,8 +380,6 @@ def _run(args: argparse.Namespace, effects: list[str], seed: int) -> int:
 def _check_arguments(args: argparse.Namespace, seed: int) -> None:
     if not 10.0 <= args.duration <= 600.0:
         raise ParameterError(f'--duration must be 10 to 600 s, got {args.duration:g}')
-    if args.clean and not 2.0 <= args.clean <= 600.0:
-        raise ParameterError(f'--clean must be 0 or 2 to 600 s, got {args.clean:g}')
     if seed < 1:
         raise ParameterError(f'--seed must be at least 1, got {seed}')
 
@@ -416,7 +387,7 @@ def _check_arguments(args: argparse.Namespace, seed: int) -> None:
 def _round(
     folder: Path,
     world: LoopFiles,
-    clean: Path | None,
+    clean: Path,
     effect: str,
     seed: int,
     args: argparse.Namespace,
@@ -428,26 +399,22 @@ def _round(
     unit = {'effect': effect, 'effect_seed': seed, 'effect_file': truth_file}
     say(f'{duration_s:g} s with an effect that only truth.json knows')
     noisy = {'optical_noise_m': Accuracy.optical_position_m, 'seed': 2}
-    watched = {'model_file': model} | ({'baseline_file': clean} if clean else {})
-    first = record(
-        Run(
-            folder / 'first', world.setup, duration_s, unit | noisy,
-            watched=watched if args.watch else None,
-        )
-    )  # fmt: skip
+    first = record(Run(folder / 'first', world.setup, duration_s, unit | noisy))
     say('diagnosis')
     began_s = time.monotonic()
     diagnosis = _diagnose(first, clean, model, folder / 'diagnosis')
     took_s = time.monotonic() - began_s
     corrected = folder / 'diagnosis' / 'model.yaml'
     second_s = SECOND_SHARE * duration_s
-    follows = clean is not None and _drifts(corrected, first)
+    follows = _drifts(corrected, first)
     say(f'the corrected model is served, {second_s:g} s on another path')
     unit |= {'path_phase_rad': OTHER_PATH_RAD, 'seed': 3}
     baseline = clean if follows else None
     second = record(
         Run(folder / 'second', world.setup, second_s, unit, corrected, baseline, model)
     )
+    runs = {'first': load_session(first), 'second': load_session(second)}
+    kept = {name: kept_share(session) for name, session in runs.items()}
     truth = json.loads(truth_file.read_text(encoding='utf-8'))  # not before all is analysed
     return {
         'truth': truth,
@@ -456,28 +423,11 @@ def _round(
         'parameters': parameter_errors(truth, diagnosis),
         'unexplained': diagnosis['unexplained'],
         'first_run_held_out': diagnosis['held_out'],
-        'second_run_live': second_run(
-            load_session(second), load_model(corrected), load_model(model)
-        ),
+        'second_run_live': second_run(runs['second'], load_model(corrected), load_model(model)),
         'follows_references': follows,
         'diagnosis_s': took_s,
-        **_recorded(first, second),
-    }
-
-
-def _recorded(first: Path, second: Path) -> dict[str, Any]:
-    """Return what the watcher reported in the first run, and how the machine kept up."""
-    bags = {'first': first, 'second': second}
-    sessions = {name: load_session(bag) for name, bag in bags.items()}
-    kept = {name: kept_share(session) for name, session in sessions.items()}
-    return {
-        'watcher_said_after_s': {
-            name: NANO * (warned_ns - sessions['first'].start_ns)
-            for name, warned_ns in first_warnings(first, f'{AFTER}/watcher'.strip('/')).items()
-        },
         'kept_share': kept,
         'too_busy': min(kept.values()) < LEAST_KEPT,
-        'machine': {name: signs for name, bag in bags.items() if (signs := overload(bag))},
     }
 
 
@@ -487,14 +437,12 @@ def _drifts(model_file: Path, session: Path) -> bool:
     return bool(Correction.of(model.effects, sensors, model.frequencies_hz).drifting)
 
 
-def _diagnose(bag: Path, clean: Path | None, model: Path, out: Path) -> dict[str, Any]:
+def _diagnose(bag: Path, clean: Path, model: Path, out: Path) -> dict[str, Any]:
     """Run the diagnosis in another process, which knows only the bags and the model."""
     command = [
         sys.executable, '-P', '-m', 'anser_ros.cli.main', 'diagnose', str(bag),
-        '--model', str(model), '--out', str(out),
+        '--model', str(model), '--out', str(out), '--baseline', str(clean),
     ]  # fmt: skip
-    if clean is not None:
-        command += ['--baseline', str(clean)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise DiagnosisError(f'the diagnosis failed: {done.stderr.strip()[-500:]}')
