@@ -16,7 +16,6 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from std_msgs.msg import String
 
 from anser_ros.cli.demo import load, summarise
-from anser_ros.cli.main import main
 from anser_ros.cli.output import make_new_folder, remove_empty_folders
 from anser_ros.cli.processes import Supervisor, own_domain, tail
 from anser_ros.errors import ParameterError
@@ -218,7 +217,7 @@ def test_demo_runs_and_reports(start, tmp_path):
     assert live['latency_prc50_s'] > 0, 'how late poses are and how many are lost, bench_demo says'
 
 
-def test_ctrl_c_ends_the_demo_in_order_and_it_says_how_to_go_on(start, tmp_path, capsys):
+def test_ctrl_c_ends_the_demo_in_order_and_it_says_how_to_go_on(start, tmp_path):
     demo = start('demo', '--out', tmp_path)
     demo.wait_for('tracked')
     assert demo.interrupt(signal.SIGINT) == 0, demo.output
@@ -227,14 +226,10 @@ def test_ctrl_c_ends_the_demo_in_order_and_it_says_how_to_go_on(start, tmp_path,
     assert said, demo.output
     salvage = Salvage()
     assert len(list(iter_messages(folder / 'bag', salvage))) == int(said[2]) and not salvage.lost
-    assert f'draw: anser demo --draw {folder}\n' in demo.output
     assert f'evaluate: anser evaluate {folder}/bag --model ' in demo.output
     assert 'Traceback' not in demo.output
     assert running('anser_demo_') == []
     assert not (folder / 'demo.png').exists()
-    assert main(['demo', '--draw', str(folder)]) == 0
-    assert f'picture: {folder}/demo.png' in capsys.readouterr().out
-    assert (folder / 'demo.png').read_bytes()[:8] == b'\x89PNG\r\n\x1a\n'
 
 
 def test_ctrl_c_while_the_nodes_start(start, tmp_path):
@@ -250,8 +245,3 @@ def test_ctrl_c_while_the_nodes_start(start, tmp_path):
     for log in tmp_path.glob('*/demo_*/logs/*.log'):
         assert 'Traceback' not in log.read_text()
     assert running('anser_demo_') == []
-
-
-def test_what_no_demo_left_is_not_drawn(tmp_path, capsys):
-    assert main(['demo', '--draw', str(tmp_path)]) == 2
-    assert 'holds no demo.npz' in capsys.readouterr().err

@@ -193,10 +193,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--rate', type=float, default=50.0, metavar='HZ', help='poses a second')
     for name, (words, _) in _beside().items():
         parser.add_argument(f'--{name}', action='store_true', help=words)
-    parser.add_argument('--no-metal', action='store_true', help='simulate no steel disc')
-    parser.add_argument('--no-picture', action='store_true', help='draw no picture at the end')
-    words = 'only draw the picture of an interrupted demo, from the folder of its results'
-    parser.add_argument('--draw', type=Path, metavar='DIR', help=words)
     add_json(parser, 'only the summary, as JSON')
 
 
@@ -211,10 +207,6 @@ def _asked(args: argparse.Namespace) -> dict[str, str]:
 
 def run(args: argparse.Namespace) -> int:
     """Run the demo and return the exit code; raises `ParameterError` on what cannot be run."""
-    if args.draw is not None:
-        if not (args.draw / DATA).is_file():
-            raise ParameterError(f'{args.draw} holds no {DATA} of a demo that showed poses')
-        return _report(args.draw, args, interrupted=False)
     if not 1.0 <= args.duration <= 3600.0:
         raise ParameterError(f'--duration must be 1 to 3600 s, got {args.duration:g}')
     if not 1.0 <= args.rate <= 200.0:
@@ -292,9 +284,7 @@ def _report(folder: Path, args: argparse.Namespace, *, interrupted: bool) -> int
         figures = summarise(results)
         has_poses = LIVE in figures['chains']
         summary |= figures
-        if interrupted:  # drawing takes longer than someone who interrupts wants to wait
-            summary['draw'] = f'anser demo --draw {folder}'
-        elif not args.no_picture:
+        if not interrupted:  # it takes longer than someone who interrupts wants to wait
             draw(results, folder / 'demo.png')
             summary['picture'] = str(folder / 'demo.png')
         if there:
@@ -306,7 +296,7 @@ def _report(folder: Path, args: argparse.Namespace, *, interrupted: bool) -> int
         print(json.dumps(summary, indent=1))
     else:
         _print(summary)
-    if interrupted or args.draw or not data.is_file() or has_poses:
+    if interrupted or not data.is_file() or has_poses:
         return 0
     print('anser demo: the live chain gave no pose; the table says why', file=sys.stderr)
     return 1
@@ -334,7 +324,7 @@ def _print(summary: dict[str, object]) -> None:
             f'{"bag":>8}: {summary["bag"]} ({summary.get("duration_s", 0.0):.1f} s, '
             f'{summary.get("messages", 0)} messages, {is_whole})'
         )
-    for key in ('picture', 'draw', 'evaluate'):
+    for key in ('picture', 'evaluate'):
         if key in summary:
             print(f'{key:>8}: {summary[key]}')
 
@@ -369,9 +359,7 @@ def _commands(folder: Path, port: Path, args: argparse.Namespace) -> dict[str, l
     model = config_path('demo_model.yaml')
     apart = in_namespace(f'/anser/{FROZEN}')
     return {
-        'cu_simulator': simulated_unit(
-            port, metal=not args.no_metal, metal_radius_m=METAL_RADIUS_M
-        ),
+        'cu_simulator': simulated_unit(port, metal_radius_m=METAL_RADIUS_M),
         'live': node_command(
             'live', acquisition__device=port, acquisition__rate_hz=float(args.rate),
             field_model__model_file=model, field_model__baseline_at_start=True,

@@ -63,7 +63,7 @@ def rows() -> Iterator[harness.Row]:
 
 def _run(folder: str, seconds: float) -> str:
     """Run the demo and return its bag."""
-    options = ('--duration', f'{seconds:g}', '--no-picture', '--out', folder)
+    options = ('--duration', f'{seconds:g}', '--out', folder)
     done = harness.anser('demo', '--json', *options)
     return str(json.loads(done.printed)['bag'])
 
