@@ -168,7 +168,7 @@ def test_a_model_worse_than_the_nominal_one_is_only_written_when_forced(factory,
     flux = flux + 3e-9 * rng.normal(size=flux.shape)
     few = replace(tool, flux=flux).frames(np.arange(0, 169, 12))
     bag = write_bag(tmp_path / 'b.mcap', factory.setup, few)
-    arguments = (bag, '--out', tmp_path / 'm.yaml', '--dipoles', '6x6', '--damping', '1e-9')
+    arguments = (bag, '--out', tmp_path / 'm.yaml', '--dipoles', '6x6')
     text = refusal(capsys, *arguments)
     assert "worse than the nominal model's" in text
     assert '--force' in text
@@ -196,10 +196,9 @@ def test_missing_folders_are_made_before_the_work(tmp_path, capsys, monkeypatch)
 @pytest.mark.parametrize(
     ('argument', 'said'),
     [(f'--{usage}', 'usage') for usage in (
-        'dipoles=3x4', 'dipoles=0x0', 'dipoles=many', 'estimate=colour', 'damping=x'
+        'dipoles=3x4', 'dipoles=0x0', 'dipoles=many', 'estimate=colour'
     )] + [
         ('--set=flux_noise_t=0', 'must be in'), ('--set=optical_position_m=-1', 'must be in'),
-        ('--damping=-1', 'must not be negative'), ('--damping=nan', 'must not be negative'),
     ],
 )  # fmt: skip
 def test_bad_arguments_are_refused(tmp_path, argument, said, capsys):

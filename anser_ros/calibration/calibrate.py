@@ -54,7 +54,6 @@ class Options:
     accuracy: Accuracy = field(default_factory=Accuracy)  # flux noise and pose jitter
     surveyed_m: float = SURVEYED_M  # error of a coil's place in its body along each axis
     layout: Layout | None = None  # layout of the dipoles; chosen by held-out error by default
-    damping: float | None = None  # damping of the moments; chosen by held-out error by default
     # kinds of errors of sensors and clock that are estimated together with the field; whatever is,
     # frames whose pose or field is bad are left out then, and the optical jitter is estimated
     estimate: tuple[str, ...] = ()
@@ -113,7 +112,7 @@ def fit_scan(
     thin = thin_frames(posed)
     folds = readings.fold_of_frames([m.position for m in thin])
     selection = choose_layout(thin, folds, generator, accuracy, progress, options.layout)
-    chosen, held_out = _winner(selection, thin, folds, generator, accuracy, options.damping)
+    chosen, held_out = _winner(selection, thin, folds, generator, accuracy)
     layout, damping = chosen.layout, chosen.damping
     whole = LayoutFitter(posed, generator, accuracy).fit(layout, damping, progress=progress)
 
@@ -174,7 +173,6 @@ def _winner(
     folds: Sequence[Integers],
     generator: Generator,
     accuracy: Accuracy,
-    damping: float | None,
 ) -> Tested:
     """Return the best finalist, each fitted from the start without each fold, and its damping."""
     # All candidates' fits to the same folds have the larger part in common.
@@ -192,11 +190,7 @@ def _winner(
 
         return predict_held_out(thin, folds, fit, accuracy, reference, candidate.damping)
 
-    finalists = list(selection.finalists)
-    if damping is not None:
-        finalists = [replace(one, damping=damping) for one in finalists]
-    chosen, held_out = _better([(one, tested(one)) for one in finalists])
-    return best_damped(chosen, held_out, tested) if damping is None else (chosen, held_out)
+    return best_damped(*_better([(one, tested(one)) for one in selection.finalists]), tested)
 
 
 def best_damped(

@@ -1,7 +1,6 @@
 """Fits a field model to recorded sessions, and shows what was tried and how the sensors differ."""
 
 import argparse
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from anser_ros.cli import output
 from anser_ros.cli.diagnosis_words import flux_unit
 from anser_ros.cli.page import legend_under
 from anser_ros.effects.effect import effect_named
-from anser_ros.errors import FitError, ParameterError
+from anser_ros.errors import FitError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.calibration import calibrate_sessions, check_same_board, named_kinds
@@ -56,8 +55,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         f'supports them; "none" trusts the setup for all; by default {",".join(KINDS)}; '
         f'{",".join(named_kinds())} only when named',
     )  # fmt: skip
-    words = 'damping of the moments; chosen by held-out error by default'
-    parser.add_argument('--damping', type=float, help=words)
     output.add_stated_values(parser, 'accuracy')
 
 
@@ -85,9 +82,7 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     Raises `FitError` when the nominal model is better, and that is not forced.
     """
     stated = output.stated_values(args)
-    if not 0.0 <= (args.damping or 0.0) < math.inf:
-        raise ParameterError(f'damping must not be negative, got {args.damping:g}')
-    options = Options(layout=args.dipoles, damping=args.damping, estimate=args.estimate)
+    options = Options(layout=args.dipoles, estimate=args.estimate)
     sessions = [load_session(path).with_stated(stated) for path in args.sessions]
     check_same_board(sessions)
     output.check_file(args.out)

@@ -23,7 +23,6 @@ from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import PoseWhitener, Progress, pose_precision, pose_terms
 from anser_ros.calibration.result import Calibration, with_provenance
 from anser_ros.calibration.selection import COAXIAL, LEAST_GAIN
-from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import Dipoles, EffectRecord, FieldModel, size_figures, spread_along
 from anser_ros.physics.rotations import tilted
@@ -221,11 +220,6 @@ def _fit_still(
     sessions: Sequence[Session], options: Options, progress: Progress | None = None
 ) -> Calibration:
     readings.check_single_coils(_tools(sessions))
-    if options.damping is not None:
-        raise FitError(
-            'damping: few poses of many sensors are fitted with sizes of moments that the '
-            'readings give; only --estimate none takes a damping'
-        )
     return _fitted(calibrate_still, sessions, options, progress)
 
 
