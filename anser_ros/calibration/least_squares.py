@@ -24,7 +24,7 @@ class TriangularFactor:
     """Keeps a least-squares problem as the triangular factor of its rows, by QR, in blocks."""
 
     def __init__(self, unknowns: int, right_sides: int) -> None:
-        self.unknowns = unknowns
+        self.unknowns, self.right_sides = unknowns, right_sides
         self.triangle = np.zeros((0, unknowns + right_sides))
 
     def add(self, matrix: Array, right: Array) -> None:
@@ -54,7 +54,7 @@ class GramFactor:
     """
 
     def __init__(self, unknowns: int, right_sides: int) -> None:
-        self.unknowns = unknowns
+        self.unknowns, self.right_sides = unknowns, right_sides
         self.gram = np.zeros((unknowns + right_sides, unknowns + right_sides))
 
     def add(self, matrix: Array, right: Array) -> None:

@@ -194,6 +194,26 @@ class PoseWhitener:
         return np.asarray((power - noise**2 * second - jitter) / second)
 
 
+def damped_moments(
+    factor: least_squares.TriangularFactor | least_squares.GramFactor,
+    dipoles: readings.DipoleSites,
+    dampings: Sequence[float],
+    prior: Array | None,
+) -> tuple[Array, list[least_squares.Spectrum]]:
+    """Return the moments (D, N, 2K) for D dampings, and the spectrum of each group of emitters.
+
+    ``factor``: of the dipoles' readings. ``prior`` (N, 2K): what damping pulls to; None for zero.
+    """
+    out, spectra = np.zeros((len(dampings), len(dipoles), factor.right_sides)), []
+    for emitters, rows in dipoles.groups(factor.right_sides // 2):
+        parts = np.repeat(2 * np.array(emitters), 2) + np.tile([0, 1], len(emitters))
+        spectra.append(factor.spectrum(rows))
+        start = None if prior is None else prior[rows]
+        for moments, damping in zip(out, dampings, strict=True):
+            moments[np.ix_(rows, parts)] = spectra[-1].solve(damping, start)[:, parts]
+    return out, spectra
+
+
 Progress = Callable[[str, float], None]
 
 CONVERGED = 2e-3
@@ -290,14 +310,8 @@ class MomentFitter:
                 root = np.sqrt(state.weights[block].reshape(-1, 1))
                 right = least_squares.as_real(part.flux).reshape(-1, 2 * self.emitters)
                 factor.add(root * readings.basis_rows(part, self.dipoles), root * right)
-        moments, spectra = np.zeros((len(self.dipoles), 2 * self.emitters)), []
-        for emitters, rows in self.dipoles.groups(self.emitters):
-            parts = np.repeat(2 * np.array(emitters), 2) + np.tile([0, 1], len(emitters))
-            spectrum = factor.spectrum(rows)
-            prior = None if self.prior is None else self.prior[rows]
-            moments[np.ix_(rows, parts)] = spectrum.solve(self.damping, prior)[:, parts]
-            spectra.append(spectrum)
-        return least_squares.as_complex(moments), spectra
+        moments, spectra = damped_moments(factor, self.dipoles, (self.damping,), self.prior)
+        return least_squares.as_complex(moments[0]), spectra
 
     def freedom(self, spectra: Sequence[least_squares.Spectrum]) -> float:
         """Return the effective number of parameters of an emitter."""

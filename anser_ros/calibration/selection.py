@@ -26,12 +26,13 @@ from anser_ros.calibration.layout_fit import (
     rich_layout,
 )
 from anser_ros.calibration.layouts import FREE_KINDS, Generator, Layout, place
-from anser_ros.calibration.least_squares import as_real
+from anser_ros.calibration.least_squares import GramFactor, as_real
 from anser_ros.calibration.moments import (
     MomentFit,
     MomentFitter,
     PoseWhitener,
     Progress,
+    damped_moments,
     pose_precision,
     pose_terms,
 )
@@ -118,10 +119,11 @@ class LayoutScorer:
         def scored(fold: int) -> tuple[Array, float]:
             chi, count = np.zeros(len(DAMPINGS)), 0.0
             sites, prior = self._moved_without(fold, layout) if layout.moved else placed
-            matrices, grams = same or self._tables(sites)
-            start = None if prior is None else as_real(prior) / self.noise_t
-            total = sum(gram for other, gram in grams.items() if other != fold)
-            moments = _ridges(np.asarray(total), sites, start)
+            matrices, factors = same or self._tables(sites)
+            rest = GramFactor(len(sites), self._parts)
+            rest.gram += sum(one.gram for other, one in factors.items() if other != fold)
+            start = None if prior is None else as_real(prior)
+            moments, _ = damped_moments(rest, sites, DAMPINGS, start)
             for body, matrix in zip(self._bodies, matrices, strict=True):
                 if fold in body.whiteners:
                     part, used = self._chi(body, matrix, fold, moments)
@@ -135,10 +137,10 @@ class LayoutScorer:
         curve = tuple(zip(DAMPINGS, map(float, scores), strict=True))
         return LayoutCandidate(layout, placed[0], DAMPINGS[best], float(scores[best]), curve)
 
-    def _tables(self, dipoles: DipoleSites) -> tuple[list[Array], dict[int, Array]]:
+    def _tables(self, dipoles: DipoleSites) -> tuple[list[Array], dict[int, GramFactor]]:
         matrices = [basis_rows(body.corrected, dipoles) for body in self._bodies]
-        grams = in_order(lambda fold: self._gram(fold, matrices), self._folds)
-        return matrices, dict(zip(self._folds, grams, strict=True))
+        factors = in_order(lambda fold: self._factor(fold, matrices), self._folds)
+        return matrices, dict(zip(self._folds, factors, strict=True))
 
     def _moved_without(self, fold: int, layout: Layout) -> tuple[DipoleSites, ComplexArray | None]:
         rest = [(body, body.folds != fold) for body in self._bodies]
@@ -152,17 +154,15 @@ class LayoutScorer:
     def _parts(self) -> int:
         return 2 * int(self._bodies[0].corrected.flux.shape[2])
 
-    def _gram(self, fold: int, matrices: Sequence[Array]) -> Array:
-        """Return a fold's Gram matrix of the matrix's N and the right-hand sides' 2K columns."""
-        size = matrices[0].shape[1] + self._parts
-        gram = np.zeros((size, size))
+    def _factor(self, fold: int, matrices: Sequence[Array]) -> GramFactor:
+        """Return the least-squares problem of a fold's readings."""
+        factor = GramFactor(matrices[0].shape[1], self._parts)
         for body, matrix in zip(self._bodies, matrices, strict=True):
             rows = np.repeat(body.folds == fold, len(body.corrected.sensors))
             root = np.sqrt(body.weights.reshape(-1, 1)[rows])
             right = as_real(body.corrected.flux).reshape(-1, self._parts)[rows]
-            block = root * np.concatenate([matrix[rows], right / self.noise_t], axis=1)
-            gram += block.T @ block
-        return gram
+            factor.add(root * matrix[rows], root * right)
+        return factor
 
     def _chi(
         self, body: _BodyReadings, matrix: Array, fold: int, moments: Array
@@ -173,37 +173,9 @@ class LayoutScorer:
         held_out = matrix[rows]
         sums = [
             body.whiteners[fold].chi_square(target - (held_out @ m).reshape(target.shape)).sum()
-            for m in moments * self.noise_t
+            for m in moments
         ]
         return np.array(sums), float(body.weights[mask].sum()) * target.shape[2]
-
-
-def _ridges(gram: Array, sites: DipoleSites, prior: Array | None) -> Array:
-    """Return damped solutions (D, N, M) of a Gram matrix, for each emitter of its own dipoles."""
-    count, parts = len(sites), len(gram) - len(sites)
-    out = np.zeros((len(DAMPINGS), count, parts))
-    for emitters, rows in sites.groups(parts // 2):
-        own = np.repeat(2 * np.array(emitters), 2) + np.tile([0, 1], len(emitters))
-        every = np.concatenate([rows, count + own])
-        start = None if prior is None else prior[np.ix_(rows, own)]
-        out[:, rows[:, None], own] = _ridge(gram[np.ix_(every, every)], rows.size, start)
-    return out
-
-
-def _ridge(gram: Array, unknowns: int, prior: Array | None) -> Array:
-    """Return damped solutions (D, N, M) from a Gram matrix of columns and right-hand sides."""
-    scale = np.sqrt(np.maximum(np.diag(gram)[:unknowns], 0.0))
-    scale[scale == 0.0] = 1.0
-    normal = gram[:unknowns, :unknowns] / np.outer(scale, scale)
-    right = gram[:unknowns, unknowns:] / scale[:, None]
-    if prior is not None:
-        right = right - normal @ (prior * scale[:, None])
-    values, vectors = np.linalg.eigh(normal)
-    projected = vectors.T @ right
-    least = (np.asarray(DAMPINGS) ** 2)[:, None] * values[-1]
-    steps = vectors @ (projected / (np.maximum(values, 0.0) + least)[:, :, None])
-    out = steps / scale[:, None]
-    return np.asarray(out if prior is None else out + prior)
 
 
 COUNTS = (6, 8, 10, 12, 14, 16, 18)
