@@ -48,8 +48,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_out(parser, 'measured.json and what the commands write', required=False)
     words = 'folder for sessions of the data, made if missing'
     parser.add_argument('--bags', type=Path, help=words)
-    words = 'print only the table, without the commands'
-    parser.add_argument('--quiet', action='store_true', help=words)
     add_json(parser, 'measured.json on stdout')
 
 
@@ -100,8 +98,7 @@ def _cook(
         make_folder(out)
         bags = recipe.write_sessions(folder, Path(made) / 'bags')
         for command in recipe.commands(bags, out):
-            if not args.quiet:
-                console.print(f'$ anser {" ".join(command)}', highlight=False, soft_wrap=True)
+            console.print(f'$ anser {" ".join(command)}', highlight=False, soft_wrap=True)
             printed = io.StringIO()
             with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
                 code = main.main(command)
