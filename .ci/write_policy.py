@@ -28,6 +28,8 @@ SIMULATED = ('cu_simulator', 'grid', 'replay')
 """What belongs on no graph that is secured: simulations, and the guide through a plate, which is
 gone through before. All other nodes of the package have an enclave."""
 NODES = tuple(node for node in ALL_NODES if node not in SIMULATED)
+TRANSFORMS = (('tracker', 'publish'), ('recorder', 'subscribe'))
+"""Who has to do with transforms: they are there only where tf2_msgs is installed."""
 SETTLES_S = 60.0
 """Longest time, s, for all topics of a setup to appear."""
 KINDS = (
@@ -161,6 +163,8 @@ def _asked(peer: Any) -> dict[tuple[str, str], list[str]]:
                 names = {name for name, _ in getattr(peer, question)(node, '/anser')}
             except Exception:  # noqa: BLE001 - the graph does not know the node yet
                 names = set()
+            if names and (node, verb) in TRANSFORMS:
+                names |= {'/tf', '/tf_static'}
             found[node, verb] = sorted(names - {'/anser/policy_writer'})
     return found
 

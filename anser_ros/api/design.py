@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anser_ros.api.model import Model
+from anser_ros.api.model import Model, ModelSource, field_given
 from anser_ros.api.recording import SetupSource, load_setup, poses_given
 from anser_ros.arrays import Array, numbers_of
 from anser_ros.errors import ParameterError
 from anser_ros.physics.pose_track import PoseTrack
-from anser_ros.sessions.session import Session, session_of
+from anser_ros.sessions.plausibility import check_distance
+from anser_ros.sessions.session import MOST_NOISE_T, Session, session_of
 from anser_ros.settings import Accuracy
 from anser_ros.simulation.world import Path, World, board_source
 from anser_ros.stamps import SECOND_NS
@@ -26,7 +27,7 @@ def simulate(
     path: Poses | Mapping[str, Poses],
     noise: float = Accuracy.flux_noise_t,
     *,
-    model: Model | None = None,
+    model: ModelSource | None = None,
     seed: int = 0,
 ) -> Session:
     """Simulate what the sensors of a setup read while tools move.
@@ -41,7 +42,7 @@ def simulate(
         setup's first body moves; all bodies are stated, at the same times.
     noise : float
         Standard deviation of a component of each flux, T.
-    model : Model, optional
+    model : Model or path, optional
         Field that is measured; by default that of the board as the setup draws it.
     seed : int
         Of the noise: the same seed makes the same session.
@@ -57,6 +58,8 @@ def simulate(
         When the setup breaks a rule, or its emitter kind is not one of known geometry.
     ParameterError
         When the path does not fit the setup, or the noise is negative.
+    PlausibilityError
+        When tools are nowhere near the board.
 
     Examples
     --------
@@ -77,10 +80,12 @@ def simulate(
         body in tracks and np.array_equal(tracks[body][0], times) for body in checked.bodies
     ):
         raise ParameterError(f'poses at the same times of {", ".join(checked.bodies)} are wanted')
-    if not 0.0 <= numbers_of(noise, 'noise') < np.inf:
-        raise ParameterError(f'noise must be T, 0 or more, got {noise}')
-    source = board_source(checked) if model is None else Model.load(model).field
+    if not 0.0 <= numbers_of(noise, 'noise') < MOST_NOISE_T:
+        raise ParameterError(f'noise must be T, 0 or more and below {MOST_NOISE_T}, got {noise}')
+    source = board_source(checked) if model is None else field_given(model, checked)
     paths = {body: _moving(PoseTrack(*track)) for body, track in tracks.items()}
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise ParameterError(f'seed must be a whole number, 0 or more, got {seed!r}')
     world, rng = World(checked, source, paths=paths), np.random.default_rng(seed)
     flux = np.array([world.flux(time) for time in times.tolist()])
     flux += noise * rng.normal(size=(*flux.shape, 2)).view(complex)[..., 0]
@@ -88,7 +93,10 @@ def simulate(
     flags = np.zeros(flux.shape[:2], dtype=np.int64)
     stream = RecordedFluxes(stamps, SensorRows.of(checked.sensors).channel, flags, flux)
     optical = {body: PoseStream(stamps, *track[1:]) for body, track in tracks.items()}
-    return session_of(Bag('simulated', checked, dump_setup(checked), stream, stream, optical))
+    session = session_of(Bag('simulated', checked, dump_setup(checked), stream, stream, optical))
+    for tool in session.tools:
+        check_distance('path', checked, tool)
+    return session
 
 
 def _moving(track: PoseTrack) -> Path:
@@ -104,7 +112,12 @@ PLANES = {'x': (1, 2), 'y': (0, 2), 'z': (0, 1)}
 
 
 def plot_field(
-    model: Model, emitter: int | str = 0, *, normal: str = 'y', at_m: float = 0.0, axes: Any = None
+    model: ModelSource,
+    emitter: int | str = 0,
+    *,
+    normal: str = 'y',
+    at_m: float = 0.0,
+    axes: Any = None,
 ) -> Any:
     """Draw the field of an emitter in a plane, up to 20 cm from the board's middle along each axis
     and from 2 cm above it on: its strength, and the lines that it follows.
@@ -140,13 +153,13 @@ def plot_field(
     from matplotlib import pyplot  # late: it takes a second
     from matplotlib.colors import LogNorm
 
-    model = Model.load(model)
-    field, names = model.field, model.emitters
+    field = Model.load(model).field
+    names = field.emitters
     column = names.index(emitter) if emitter in names else emitter
     if not (isinstance(column, int) and 0 <= column < len(names)):
         raise ParameterError(f'no emitter {emitter!r}; there are: {", ".join(names)}')
-    if normal not in PLANES:
-        raise ParameterError(f'normal must be x, y or z, got {normal!r}')
+    if normal not in PLANES or not np.isfinite(numbers_of(at_m, 'at_m')):
+        raise ParameterError(f'normal must be x, y or z, at_m finite, got {normal!r}, {at_m}')
     across, up = PLANES[normal]
     right = np.linspace(-0.2, 0.2, 61)
     top = right if normal == 'z' else np.linspace(0.02, 0.2, 61)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from anser_ros.api.given import Figures, Progress, SessionSource, session_given, shown
-from anser_ros.api.model import Model, ModelSource
+from anser_ros.api.model import Model, ModelSource, field_given
 from anser_ros.sessions.diagnosis import diagnose_session, other_way, to_document
 
 
@@ -46,6 +46,7 @@ def diagnose(
     session : Session or path
         With optical poses of at least one tool.
     model : Model or path
+        ``nominal`` is the board as the session's setup draws it.
     baseline : Session or path, optional
         Distortion-free recording of the same board; with it the reference sensors are used.
     progress : bool or callable, optional
@@ -71,10 +72,11 @@ def diagnose(
     >>> found.effects
     ()
     """
-    recorded, field = session_given(session), Model.load(model).field
+    recorded = session_given(session)
+    field = field_given(model, recorded.setup)
     clean = None if baseline is None else session_given(baseline)
     with shown(progress, 'diagnose') as tell:
-        if way := other_way(recorded):
+        if way := other_way(recorded, clean):
             other = way.diagnose(recorded, field, tell)
             corrected, figures = other.model, way.to_document(other)
         else:

@@ -13,7 +13,8 @@ from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.nominal import nominal_model
 from anser_ros.sessions.nominal_board import board_of
-from anser_ros.sessions.starting_model import load_model, save_model
+from anser_ros.sessions.starting_model import NOMINAL, load_model, save_model
+from anser_ros.wire.setup import Setup
 from anser_ros.wire.setup_values import AXIS_TOLERANCE
 from anser_ros.wire.text_files import path_of
 
@@ -135,3 +136,9 @@ class Model:
 
 
 ModelSource = Model | FieldModel | str | os.PathLike[str]
+
+
+def field_given(given: ModelSource, setup: Setup) -> FieldModel:
+    """Return a model's field; ``nominal`` is that of the board as a setup draws it."""
+    is_drawn = isinstance(given, str) and given == NOMINAL
+    return (Model.nominal(setup) if is_drawn else Model.load(given)).field

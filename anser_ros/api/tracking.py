@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.api.given import Progress, SessionSource, session_given, shown
-from anser_ros.api.model import Model, ModelSource
+from anser_ros.api.model import ModelSource, field_given
 from anser_ros.arrays import Array, Booleans, Integers, numbers_of
 from anser_ros.pose_states import OK
 from anser_ros.sessions.tracked_session import PoseSeries, to_document, track_session
@@ -151,6 +151,7 @@ def track(
     ----------
     session : Session or path
     model : Model or path
+        ``nominal`` is the board as the session's setup draws it.
     refit : bool
         Whether the model follows the session's reference sensors, frame by frame.
     baseline : Session or path, optional
@@ -165,6 +166,8 @@ def track(
     ------
     BagError
         When the session has no tool fluxes, or a refit lacks references or a baseline.
+    ParameterError
+        When a baseline is given without a refit.
     ModelFileError
         When the model's emitters are not the session's.
 
@@ -181,7 +184,8 @@ def track(
     """
     stated = {} if gate is None else {'gate': float(numbers_of(gate, 'gate'))}
     settings = TrackerSettings(**stated)  # type: ignore[arg-type]
-    recorded, field = session_given(session), Model.load(model).field
+    recorded = session_given(session)
+    field = field_given(model, recorded.setup)
     clean = None if baseline is None else session_given(baseline)
     with shown(progress, 'track') as tell:
         found = track_session(recorded, field, settings, clean, refit, progress=tell)

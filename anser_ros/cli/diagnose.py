@@ -25,6 +25,10 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.diagnosis import SessionDiagnosis, diagnose_session, other_way, to_document
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for, save_model
+from anser_ros.settings import SECTIONS, VALUES
+
+USED_ALONE = {*SECTIONS['tools'], *(n for n in SECTIONS['accuracy'] if 'reference' not in n)}
+"""Values that may be stated where no baseline is given, and so no references are used."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,12 +53,14 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         done: output.Result = kind.diagnose(args, tell)
         return done
     need_model(args)
-    session = load_session(args.session).with_stated(output.stated_values(args))
+    idle = () if args.baseline else (n for n in VALUES if n not in USED_ALONE)
+    stated = output.stated_values(args, idle, '--baseline')
+    session = load_session(args.session).with_stated(stated)
     model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)
     baseline = load_session(args.baseline) if args.baseline else None
     output.make_folder(args.out)
     names = {'session': args.session, 'model': args.model}
-    if way := other_way(session):
+    if way := other_way(session, baseline):
         other = way.diagnose(session, model, tell)
         tell('writing the report')
         document, corrected = way.to_document(other), other.model

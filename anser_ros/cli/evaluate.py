@@ -27,6 +27,7 @@ from anser_ros.sessions.tracked_session import (
     track_session,
     write_tables,
 )
+from anser_ros.settings import SECTIONS
 from anser_ros.tracking.estimate import TrackerSettings
 
 MOST_POINTS = 4000
@@ -274,10 +275,11 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         done: output.Result = kind.evaluate(args, tell)
         return done
     sessions.need_model(args)
-    session = load_session(args.session).with_stated(output.stated_values(args))
     for name in ('witnesses', 'references', 'baseline'):
         if getattr(args, name) and not args.refit:
             raise ParameterError(f'--{name} is of a refit; it needs --refit')
+    stated = output.stated_values(args, () if args.refit else SECTIONS['refit'], '--refit')
+    session = load_session(args.session).with_stated(stated)
     if args.references is not None:
         session = with_references(session, parse_references(args.references))
     model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)

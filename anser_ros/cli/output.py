@@ -45,16 +45,29 @@ def add_stated_values(parser: argparse.ArgumentParser, *sections: str) -> None:
     """Declare ``--set``; ``sections`` of `SECTIONS` are those that the command uses."""
     from anser_ros.settings import SECTIONS
 
-    names = ', '.join(name for section in sections for name in SECTIONS[section])
-    words = 'state a value in place of the setup document and the default; may be repeated. '
-    add_list(parser, '--set', dest='stated', metavar='NAME=VALUE', help=f'{words}Names: {names}')
+    names = [name for section in sections for name in SECTIONS[section]]
+    words = 'state a value in place of the setup document and the default; may be repeated. Names:'
+    words = f'{words} {", ".join(names)}'
+    add_list(parser, '--set', dest='stated', metavar='NAME=VALUE', help=words)
+    parser.set_defaults(can_state=names)
 
 
-def stated_values(args: argparse.Namespace) -> dict[str, float]:
-    """Return the values that the command line states; raises as `parse_entries`."""
+def stated_values(
+    args: argparse.Namespace, idle: Iterable[str] = (), option: str = ''
+) -> dict[str, float]:
+    """Return the values that the command line states; raises as `parse_entries`.
+
+    Raises `ParameterError` for one that the command does not use, or that is idle without an
+    option.
+    """
     from anser_ros.settings import parse_entries
 
-    return parse_entries(args.stated)
+    stated = parse_entries(args.stated)
+    if useless := stated.keys() - args.can_state:
+        raise ParameterError(f'--set {", ".join(sorted(useless))} has no effect on this command')
+    if useless := stated.keys() & set(idle):
+        raise ParameterError(f'--set {", ".join(sorted(useless))} has no effect without {option}')
+    return stated
 
 
 def add_model(parser: argparse.ArgumentParser, **options: Any) -> None:

@@ -353,7 +353,7 @@ class FieldModel:
         """Return each emitter's flux (..., K), T, along unit axes at places, m, in fg."""
         spans = None if lengths is None else np.broadcast_to(lengths, points.shape[:-1]).ravel()
         flux = self.dipoles.flux(points.reshape(-1, 3), axes.reshape(-1, 3), spans)
-        return flux.reshape(*points.shape[:-1], -1)
+        return flux.reshape(*points.shape[:-1], len(self.emitters))
 
     def __repr__(self) -> str:
         return f'FieldModel({len(self.positions)} dipoles, emitters {", ".join(self.emitters)})'
@@ -364,7 +364,8 @@ class FieldModel:
         Raises `ParameterError` when the points are of another shape, or no numbers.
         """
         places = numbers_of(points, 'points', 3)
-        return self.dipoles.field(places.reshape(-1, 3)).reshape(*places.shape, -1)
+        fields = self.dipoles.field(places.reshape(-1, 3))
+        return fields.reshape(*places.shape, len(self.emitters))
 
     @property
     def dipoles(self) -> Dipoles:

@@ -31,7 +31,13 @@ from anser_ros.frames.intake import Frame
 from anser_ros.integrity.board_place import BoardPlace
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode
-from anser_ros.nodes.streams.clouds import GivenModel, ModelWriter, read_frame, readings_of
+from anser_ros.nodes.streams.clouds import (
+    GivenModel,
+    ModelWriter,
+    is_frame,
+    read_frame,
+    readings_of,
+)
 from anser_ros.nodes.streams.one_source import OneSource
 from anser_ros.physics.rotations import rotation_of_quaternion
 from anser_ros.pose_states import code_of
@@ -52,7 +58,7 @@ def pose_in(message: PoseStamped, frame_id: str, body: str) -> tuple[Array, Arra
 
     Raises `FrameError` when the pose is given in another frame, or is no pose.
     """
-    if not message.header.frame_id.endswith(frame_id):
+    if not is_frame(message.header.frame_id, frame_id):
         raise FrameError(f'the pose of {body} is in {message.header.frame_id!r}, not {frame_id!r}')
     numbers = pose_numbers(message.pose)
     position, quaternion = np.array(numbers[:3]), unit_quaternions(numbers[3:])

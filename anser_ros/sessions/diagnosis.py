@@ -15,7 +15,7 @@ from anser_ros import extensions
 from anser_ros.arrays import Array
 from anser_ros.diagnosis.diagnose import SCHEMA, Diagnosis, diagnose
 from anser_ros.diagnosis.problem import Problem, Spread, build_problem, test_blocks
-from anser_ros.errors import DiagnosisError
+from anser_ros.errors import DiagnosisError, ParameterError
 from anser_ros.field.model import EffectRecord, FieldModel, plain
 from anser_ros.parallel import in_order
 from anser_ros.sessions.follower import ModelFollower
@@ -232,11 +232,15 @@ def effect_figures(record: EffectRecord, without_t: float) -> dict[str, Any]:
     }
 
 
-def other_way(session: Session) -> ModuleType | None:
+def other_way(session: Session, baseline: Session | None = None) -> ModuleType | None:
     """Return the module of an application that diagnoses sessions of this kind, None for no other.
 
+    Raises `ParameterError` where a baseline is given that it has no use for.
     It has ``accepts(session)``, ``diagnose(session, model, progress)`` whose result has a
     ``model``, ``to_document(result)``, and the name of a module ``REPORT`` with
     ``render(result, document, session=, model=)``.
     """
-    return next((way for way in extensions.loaded('DIAGNOSES') if way.accepts(session)), None)
+    way = next((way for way in extensions.loaded('DIAGNOSES') if way.accepts(session)), None)
+    if baseline is not None and (way is not None or session.reference is None):
+        raise ParameterError(f'{session.path}: a baseline has no effect: no references are used')
+    return way

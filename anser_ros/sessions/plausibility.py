@@ -235,7 +235,7 @@ def plausible_tools(
         thawed, remarks = _thawed(path, tool)
         words += remarks
         check_conventions(path, setup, nominal, thawed)
-        _check_distance(path, setup, thawed)
+        check_distance(path, setup, thawed)
         kept.append(thawed)
     return tuple(kept), '; '.join(words)
 
@@ -357,7 +357,8 @@ def _change(tool: Measurements, begin: float, end: float) -> float:
     return float(np.median(changes)) if changes else 0.0
 
 
-def _check_distance(path: str, setup: Setup, tool: Measurements) -> None:
+def check_distance(path: str, setup: Setup, tool: Measurements) -> None:
+    """Raise `PlausibilityError` where a tool's optical poses are not near the board."""
     if tool.track is None:
         return
     volume = tracked_volume(setup)

@@ -200,17 +200,20 @@ def track_session(
     fluxes and moments are used (the article's way). Progress gets the finished share, 0 to 1.
     Raises `BagError` when the session has no tool fluxes, or a refit lacks references or a
     baseline; `ParameterError` when such models are to be used beside a refit, or with one phase of
-    the fluxes; `ModelFileError` when the model's emitters are not the session's, or the session's
-    references locate the board elsewhere. With the gate switched off the latter is not checked.
+    the fluxes, or a baseline without a refit; `ModelFileError` when the model's emitters are not
+    the session's, or its references locate the board elsewhere, which is not checked with the gate
+    switched off.
     """
     if models is not None and (refit or in_phase):
         raise ParameterError(
             "models of their own are used without a refit, with both of the fluxes' phases"
         )
+    if baseline is not None and not refit:
+        raise ParameterError('a baseline is of a refit, and has no effect without one')
     if settings is None or settings.has_gate:
         check_place(model, session)
     used = in_phase_model(model) if in_phase else model
-    prepared = prepare(session, used, baseline if refit else None)
+    prepared = prepare(session, used, baseline)
     follower = None if models is None else models(prepared)
     if refit:
         follower = ModelFollower(prepared, witnesses)

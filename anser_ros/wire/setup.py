@@ -119,8 +119,11 @@ class Setup:
     said: frozenset[str] = frozenset()  # names of values that were stated over the document's
 
     def __repr__(self) -> str:
-        count = len(self.emitter.coils)
-        return f'Setup({count} emitters, {len(self.sensors)} coils of {", ".join(self.bodies)})'
+        of = f' of {", ".join(self.bodies)}' if self.bodies else ''
+        return (
+            f'Setup({len(self.emitter.coils)} emitters, {len(self.tool_sensors)} tool coils{of}, '
+            f'{len(self.reference_sensors)} reference coils)'
+        )
 
     @cached_property
     def refit(self) -> RefitSettings:
@@ -134,6 +137,8 @@ class Setup:
 
     def with_stated(self, stated: Mapping[str, float]) -> 'Setup':
         """Return the setup with values stated before its own; raises `ParameterError`."""
+        if not isinstance(stated, Mapping):
+            raise ParameterError(f'values must be a mapping by name, got {stated!r}')
         together = {**self.stated, **stated}
         settings_from(together)
         return replace(self, stated=together, said=self.said | stated.keys())

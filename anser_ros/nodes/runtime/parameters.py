@@ -33,6 +33,7 @@ class Rule:
     # inclusive bounds of a number, or of every number of a list
     within: tuple[float, float] = (-math.inf, math.inf)
     choices: tuple[str, ...] = ()  # the allowed texts; empty when any will do
+    pattern: str = '(?s).*'  # what a text must be
     live: bool = False  # whether it may change while the node runs
 
 
@@ -108,6 +109,8 @@ def _check(name: str, kind: Any, rule: Rule, value: Any) -> Any:
             raise ParameterError(f'parameter {name}: {value} is below {low}')
         if value > high:
             raise ParameterError(f'parameter {name}: {value} is above {high}')
+    if kind is str and not re.fullmatch(rule.pattern, value):
+        raise ParameterError(f'parameter {name}: {value!r} is no {rule.description}')
     if rule.choices and value not in rule.choices:
         raise ParameterError(
             f'parameter {name}: {value!r} is none of {", ".join(map(repr, rule.choices))}'
@@ -160,7 +163,8 @@ def optical_parameter() -> Any:
 
 def prefix_parameter() -> Any:
     """Return the parameter of a node that publishes in the board's frame."""
-    return parameter('', "prefix of the frames, the board's too, if there are several boards")
+    words = "prefix of the frames, the board's too, for several boards; it ends with _ or /"
+    return parameter('', words, pattern='(.*[_/])?')
 
 
 def tracked_parameter() -> Any:

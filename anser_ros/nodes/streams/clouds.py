@@ -77,6 +77,11 @@ def layout_of(message: PointCloud2) -> tuple[list[PointFieldTuple], int, int, An
     return fields, message.point_step, int(message.width), message.data
 
 
+def is_frame(given_id: str, frame_id: str) -> bool:
+    """Return whether a frame is the one, alone or behind a prefix that ends with _ or /."""
+    return given_id == frame_id or given_id.endswith((f'_{frame_id}', f'/{frame_id}'))
+
+
 def read_frame(message: PointCloud2, frame_id: str, count: Count) -> tuple[int, FluxPoints]:
     """Read a flux message that must be in a frame, with any prefix; its peculiarities are counted.
 
@@ -84,7 +89,7 @@ def read_frame(message: PointCloud2, frame_id: str, count: Count) -> tuple[int, 
     Raises `LayoutError` when it is in another frame, has no stamp, or is no flux cloud.
     """
     given_id = message.header.frame_id
-    if not given_id.endswith(frame_id):
+    if not is_frame(given_id, frame_id):
         count('fluxes_other_frame_id', 1)
         raise LayoutError(f'fluxes in the frame {given_id!r}, the setup is in {frame_id!r}')
     if message.is_bigendian:
