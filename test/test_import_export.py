@@ -145,7 +145,7 @@ def test_columns_of_csv_become_a_session_with_poses(folder, moving, capsys):
         ({'colour': 'red'}, 'no key colour'),
         ({'stamp': 'B'}, 'so B is not a column'),
         ({'stamp': 'z'}, 'stamps are alike: are they set'),
-        ({'time': {'unit': 'h'}}, 'fluxes[0]: time: unit must be among s, ms'),
+        ({'time': {'unit': 'week'}}, 'fluxes[0]: time: unit must be among s, ms'),
     ],
 )
 def test_what_is_wrong_with_a_document_is_one_line(folder, moving, capsys, change, said):

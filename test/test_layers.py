@@ -54,7 +54,7 @@ ROOMS = {
     'ament_index_python': NODES,
     'std_srvs': NODES,
     'serial': ('wire/port.py',),
-    'mcap': ('wire/bag.py', 'wire/bag_writer.py'),
+    'mcap': ('wire/bag.py', 'wire/bag_files.py', 'wire/bag_writer.py'),
     'mcap_ros2': ('wire/bag.py', 'wire/bag_writer.py'),
     'pyigtl': (),
     'rich': (*NODES, *COMMANDS),

@@ -248,10 +248,13 @@ class TestCommands:
             given += ['--model', 'nominal']
         for entry in entries({key: OTHER[key] for key in used}):
             given += ['--set', entry]
-        with pytest.raises(ParameterError, match='kept'):
-            args = parser.parse_args(given)
+        baseline = ['--baseline', str(BAGS / 'scan.mcap')]
+        kept = {'evaluate': ['--refit'], 'diagnose': baseline}.get(name, [])
+        for words, options in (('kept', kept), ('effect', [] if kept else ['--set', 'seed=3'])):
+            args = parser.parse_args(given + options)
             args.session = getattr(args, 'session', None) or args.sessions[0]
-            module.work(args, lambda *words: None)
+            with pytest.raises(ParameterError, match=words):
+                module.work(args, lambda *words: None)
         assert all(read(seen[0].setup.refit, key) == OTHER[key] for key in used)
 
     def test_tracking_starts_from_the_stated_noise(self):

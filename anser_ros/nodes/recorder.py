@@ -184,7 +184,7 @@ class Faults:
         ended, as they do when asked to.
         """
         faults = [
-            f'{name}: {now.message}'
+            f'{name}: {"poses were withheld" if now.level == Level.OK else now.message}'
             for name, now in statuses.items()
             if name.startswith(self._begin) and name != self._own and self._is_new(name, now)
         ]

@@ -85,6 +85,7 @@ def import_bag(
     return ImportedBag(dict(written), dict(left_out), salvage.lost)
 
 
+MOST_ALIKE = 2.5  # poses with the same stamp from which on stamps are not those of the poses
 CSV, TUM, MAT = 'csv', 'tum', 'mat'
 FORMATS = (CSV, TUM, MAT)
 """Forms of files; TUM, which `evo` reads, has poses only."""
@@ -105,6 +106,8 @@ def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> tuple[dict
         name = f'{stem}.{"txt" if form == TUM else form}'
         _write_poses(out / name, poses, form)
         written[name] = int(poses.stamp_ns.size)
+        if written[name] > MOST_ALIKE * len(np.unique(poses.stamp_ns)):
+            salvage.add(f'several poses of {topic} have each stamp: cut to seconds?')
     if form != TUM:
         for which, fluxes in read_fluxes(path).items():
             name = f'{which}_flux.{form}'

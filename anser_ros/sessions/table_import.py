@@ -8,6 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import yaml
 from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
+from anser_ros.sessions.plausibility import check_positions
 from anser_ros.stamps import stamp_fault
 from anser_ros.wire import recorded
 from anser_ros.wire.bag_writer import FLUX_TOPICS, SessionWriter
@@ -144,6 +146,11 @@ def import_tables(document: Path, out: Path) -> tuple[dict[str, int], list[str]]
         spec = read_yaml(text)
     except yaml.YAMLError as error:
         raise ParameterError(f'{document}: {" ".join(str(error).split())}') from error
+    for number, line in enumerate(text.splitlines(), 1):
+        if "'?'" in line:
+            raise ParameterError(
+                f'{document}: line {number} lacks what stands for ?: {line.strip()}'
+            )
     try:
         made = _Import(spec, document.parent)
         return made.write(out), made.notes
@@ -244,7 +251,7 @@ class _Import:
         base = self._time if time is None else _time_base(time, f'{entry.what}: time')
         unit_ns, start_ns = base
         if column.dtype.kind in 'iu':  # exact, as nanoseconds since 1970 have 19 digits
-            stamps = [start_ns + int(v) * int(unit_ns) for v in column.tolist()]
+            stamps = [start_ns + round(int(v) * Fraction(unit_ns)) for v in column.tolist()]
         else:
             values = _real(column, table, str(entry.get('stamp')))
             if not np.isfinite(values).all():
@@ -319,13 +326,15 @@ class _Import:
         good = np.isfinite(position).all(axis=1) & np.isfinite(quaternion).all(axis=1)
         unit = np.isfinite(recorded.unit_quaternions(quaternion)).all(axis=1)
         none = good & (quaternion == 0.0).all(axis=1)
-        if 2 * np.count_nonzero(none) > len(stamps) or (good & ~unit & ~none).any():
+        recorded.check_not_zero(table.path, quaternion)
+        if (good & ~unit & ~none).any():
             raise ParameterError(f'{table.path}: quaternions are not of unit length')
         good &= unit
         quaternion[good] = recorded.unit_quaternions(quaternion[good])
         if lacking := len(stamps) - int(good.sum()):
             words = f'{lacking} pose{"s" * (lacking > 1)} without numbers or rotation left out'
             self.notes.append(f'{table.path}: {words}')
+        check_positions(str(table.path), scale * position[good])
         for row in np.flatnonzero(good).tolist():
             put = partial(
                 SessionWriter.write_pose, topic=topic, stamp_ns=stamps[row],
@@ -342,6 +351,9 @@ def _time_base(given: Any, what: str) -> tuple[float, int]:
     start_ns = time.get('start_ns', 0)
     if not isinstance(start_ns, int) or isinstance(start_ns, bool):
         raise ParameterError(f'{what}: start_ns must be a whole number, got {start_ns!r}')
+    unit = time.get('unit', 's')
+    if type(unit) in (int, float) and unit > 0:  # seconds from one count to the next
+        return unit * TIME_NS['s'], start_ns
     return time.choice('unit', TIME_NS, 's'), start_ns
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.errors import ParameterError
 from anser_ros.stamps import stamp_of
 from anser_ros.wire.setup import Setup, topic_of
 
@@ -25,6 +26,19 @@ def unit_quaternions(given: ArrayLike) -> Array:
     with np.errstate(invalid='ignore', divide='ignore'):
         unit = np.where(abs(length - 1.0) <= LENGTH_TOLERANCE, quaternions / length, np.nan)
     return np.asarray(unit)
+
+
+MOST_ZERO = 0.5
+"""Share of zero quaternions, a tracker's mark for no pose, from which on a table has no poses:
+what was not seen half of the time is no recording, and columns of another meaning are zero."""
+
+
+def check_not_zero(path: object, quaternions: Array) -> None:
+    """Raise `ParameterError` where too many quaternions (n, 4) of a file are zero."""
+    zero = int((quaternions == 0.0).all(axis=1).sum())
+    if zero >= MOST_ZERO * len(quaternions) > 0:
+        words = f'{zero} of {len(quaternions)} quaternions are zero'
+        raise ParameterError(f'{path}: {words}: is it a file of poses, are the columns right?')
 
 
 def pose_numbers(pose: Any) -> tuple[float, ...]:

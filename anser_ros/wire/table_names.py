@@ -6,9 +6,12 @@ from typing import Any, NamedTuple
 
 from anser_ros.errors import ParameterError
 
-LENGTH_M = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'inch': 0.0254}
+LENGTH_M = {
+    'm': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'inch': 0.0254, 'dm': 0.1, 'km': 1e3,
+    'ft': 0.3048,
+}  # fmt: skip
 """Metres in a unit of length."""
-TIME_NS = {'s': 1e9, 'ms': 1e6, 'us': 1e3, 'ns': 1.0}
+TIME_NS = {'s': 1e9, 'ms': 1e6, 'us': 1e3, 'ns': 1.0, 'min': 6e10, 'h': 3.6e12, 'day': 8.64e13}
 """Nanoseconds in a unit of time."""
 _WORDS = {
     'm': 'm meter meters metre metres', 'cm': 'cm centimeter centimeters centimetres',
@@ -16,6 +19,8 @@ _WORDS = {
     'um': 'um μm micron microns micrometer micrometers micrometre micrometres',
     's': 's sec secs second seconds', 'ms': 'ms msec millisec milliseconds',
     'us': 'us usec microseconds', 'ns': 'ns nsec nanosec nanoseconds nsecs nanosecs',
+    'min': 'min minute minutes', 'h': 'h hr hour hours', 'day': 'day days',
+    'dm': 'dm', 'km': 'km', 'ft': 'ft foot feet',
     'deg': 'deg degree degrees', 'rad': 'rad radian radians',
 }  # fmt: skip
 UNITS = {word: unit for unit, words in _WORDS.items() for word in words.split()}
@@ -50,13 +55,15 @@ def is_unit(cell: str) -> bool:
     return not word or word in UNITS or word in ('none', 'quat', 'quaternion')
 
 
-def meaning_of(name: str, unit: str = '') -> Meaning:
-    """Return what a name means, with the unit that a row of units states.
-
-    ``Tool1 posX (mm)`` has the words tool, 1, pos, x, mm.
-    """
+def words_of(name: str) -> list[str]:
+    """Return the words of a name: ``Tool1 posX (mm)`` has tool, 1, pos, x, mm."""
     parted = re.sub('([a-z])([A-Z])', r'\1 \2', name)
-    words = re.findall('[^\\W\\d_]+|\\d+', parted.casefold())
+    return re.findall('[^\\W\\d_]+|\\d+', parted.casefold())
+
+
+def meaning_of(name: str, unit: str = '') -> Meaning:
+    """Return what a name means, with the unit that a row of units states."""
+    words = words_of(name)
     unit = UNITS.get(unit, '')
     stated = [word for word in words[:-1] if word in UNITS and len(word) > 1 and word != 'in']
     stated += [word for word in words[-1:] if word in UNITS]

@@ -133,7 +133,7 @@ def read_table(path: str | os.PathLike[str], *, as_text: bool = False) -> Table:
     of a name, or a row of another length than its header, with its line.
     """
     name = os.fspath(path)
-    text = read_text(path, any_letters=True)
+    text = read_text(path, any_letters=True).replace('\N{MINUS SIGN}', '-')
     every = [(n, line.strip(' ')) for n, line in enumerate(text.splitlines(), 1)]
     lines = [one for one in every if one[1].strip('\t ,;|') and not one[1].startswith(COMMENTS)]
     texts = [line for _, line in lines]
@@ -237,8 +237,8 @@ def _header(above: list[list[str]], width: int) -> tuple[list[str], list[str]]:
 
 MARKUPS = ('.fcsv', '.mrk.json')
 """Endings of 3D Slicer's lists of points."""
-SIGNS = {'LPS': (-1.0, -1.0, 1.0), '1': (-1.0, -1.0, 1.0)}
-"""What turns a list's axes into right, anterior, superior, in which it is by default."""
+AXES = {'RAS': (1.0, 1.0, 1.0), 'LPS': (-1.0, -1.0, 1.0)}
+"""Signs that turn a list's axes into right, anterior, superior; older lists count both from 0."""
 
 
 def read_points(path: Path) -> Array:
@@ -247,19 +247,26 @@ def read_points(path: Path) -> Array:
     A list of 3D Slicer is returned in the axes right, anterior, superior, whichever it has; gaps
     of a table are NaN. Raises `ParameterError`.
     """
-    if not path.name.endswith(MARKUPS):
+    if not path.name.lower().endswith(MARKUPS):
         return read_table(path).positions(with_gaps=True)
     text = read_text(path, any_letters=True)
-    if path.suffix == '.json':
+    if path.suffix.lower() == '.json':
         try:
             (markups,) = json.loads(text)['markups']
             system, unit = markups.get('coordinateSystem', 'LPS'), markups['coordinateUnits']
-            places = np.array([point['position'] for point in markups['controlPoints']])
-            scaled = LENGTH_M[unit] * places.reshape(-1, 3)
-        except (ValueError, KeyError, TypeError) as error:
-            raise ParameterError(f'{path}: no list of points of 3D Slicer: {error}') from error
+            points = markups['controlPoints']
+            places = np.array([point['position'] for point in points], np.float64).reshape(-1, 3)
+            is_set = [point.get('positionStatus', 'defined') == 'defined' for point in points]
+            places[np.logical_not(is_set)] = np.nan
+            scaled = LENGTH_M[unit if isinstance(unit, str) else unit[0]] * places
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            words = 'no list of points of 3D Slicer with coordinateUnits and controlPoints'
+            raise ParameterError(f'{path}: {words}') from error
     else:
         stated = re.search(r'CoordinateSystem\s*=\s*(\w+)', text)
         system, table = stated[1] if stated else 'RAS', read_table(path)
         scaled = 1e-3 * table.numbers('xyz' if table.has_names else '234')
-    return np.asarray(scaled * SIGNS.get(str(system), (1.0, 1.0, 1.0)))
+    axes = dict(zip('01', AXES, strict=True)).get(str(system), str(system).upper())
+    if axes not in AXES:
+        raise ParameterError(f'{path}: points in {system}: save them in RAS or LPS')
+    return np.asarray(scaled * AXES[axes])

@@ -22,6 +22,10 @@ def path_of(given: str | os.PathLike[str], what: str) -> Path:
     raise ParameterError(f'{what} is wanted as a path, got {type(given).__name__}')
 
 
+PACKED = {b'PK': ', but a workbook or archive: export CSV', b'\x1f\x8b': ': unpack it (gzip)'}
+"""What other files are by their first bytes, and what makes a text of them."""
+
+
 def read_text(
     path: str | os.PathLike[str],
     kind: type[AnserError] = ParameterError,
@@ -40,7 +44,8 @@ def read_text(
     except UnicodeDecodeError:
         text = data.decode('cp1252', 'replace') if any_letters else '\0'
     if '\0' in text:
-        raise kind(f'{os.fspath(path)}: not a text in UTF-8')
+        why = next((words for begin, words in PACKED.items() if data.startswith(begin)), '')
+        raise kind(f'{os.fspath(path)}: not a text in UTF-8{why}')
     return text
 
 

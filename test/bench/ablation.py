@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, ScalarFormatter
 
-from anser_ros.cli.page import legend_below, save
+from anser_ros.cli.page import legend_below, save, spell_out
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import FieldFunction, default_clouds, excitation_for
@@ -188,10 +188,10 @@ def plot(rows: Sequence[AblationRow], path: Path, titles: dict[str, str]) -> Non
         axes.set_xscale('log', base=2)
         axes.set_yscale('log')
         axes.set_xticks(sorted({row.references for row in here[1:]}))
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_formatter(ScalarFormatter())
-            axis.set_minor_formatter(NullFormatter())
-        axes.set(title=titles[session], xlabel='reference coils', ylabel='position RMSE / mm')
+        axes.xaxis.set_major_formatter(ScalarFormatter())
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        spell_out(axes.yaxis)
+        axes.set(title=titles[session], xlabel='reference coils', ylabel='position RMSE, mm')
         axes.grid(True, which='both', alpha=0.3)
     legend_below(figure, figure.axes[0])
     save(figure, path)

@@ -13,17 +13,20 @@ from scipy.spatial.transform import Rotation
 from anser_ros.arrays import AnyArray, Array, Booleans
 from anser_ros.errors import DiagnosisError, PlausibilityError
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
+from anser_ros.sessions.import_export import MOST_ALIKE
 from anser_ros.stamps import NANO, Order, order_of
 
 REFERENCE = 'optical'  # name of the reference among a session's streams
 FARTHEST = 1e6
 """Coordinate, m, from which it is a marker for no pose and no position; NDI's is 3.7e28."""
+MOST_MARKED = 0.5
+"""Share of places with three equal coordinates, such as 0 or -9999, below which they are markers
+for no pose: none is measured so, and of what was drawn or simulated they are more."""
 NO_TURN = 0.1
 """Norm of a quaternion below which it is a marker for no pose; a rounded one has a norm near 1."""
 LEAP_M, LEAP_RAD, LEAP_TIMES = 0.01, 0.25, 3.0
 """How far a pose is from the line between its neighbours if it leaps: m, rad, and in distances of
 these from each other. A hand that shakes turns back within 5 mm at 20 poses a second."""
-MOST_ALIKE = 2.5  # poses with the same stamp from which on stamps are not those of the poses
 LEAST_STEP_S, LEAST_INTERVALS, MOST_STEPS = 0.1, 3.0, 5
 """Least leap of stamps, s and intervals, that may be a step of a clock, and most of them."""
 STRETCH, FEWEST_POSES, LEAST_WAY_M = 5, 50, 3e-3
@@ -148,6 +151,9 @@ def sequence_of(name: str, time: Array, position: Array, quaternion: Array) -> P
     norm = np.linalg.norm(quaternion, axis=1)
     whole = np.isfinite(position).all(axis=1) & (np.abs(position) < FARTHEST).all(axis=1)
     whole &= np.isfinite(norm) & (norm > NO_TURN) & (norm < FARTHEST)
+    alike = whole & (position == position[:, :1]).all(axis=1)
+    if alike.sum() < MOST_MARKED * whole.sum():
+        whole &= ~alike
     crooked = whole & (np.abs(norm - 1) > NOT_UNIT)
     if 2 * int(crooked.sum()) > max(int(whole.sum()), 1):
         raise PlausibilityError(

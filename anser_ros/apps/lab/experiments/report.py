@@ -42,6 +42,7 @@ def draw_all(study: Study, folder: Path) -> dict[str, str]:
             folder / 'fig_7.png',
             {f'{d} cm': tracking[f'fig_7 {d} cm']['drawing'] for d in HEAD_DISTANCES_CM},
             'X-ray head at several distances, uncompensated',
+            is_ordered=True,
         ),
         'Fig. 8': _lattices(tracking[f'fig_7 {HEAD_DISTANCES_CM[-1]} cm']['drawing'], folder),
         'Fig. 9': _cdfs(
@@ -70,13 +71,22 @@ def _save(figure: Any, path: Path, title: str) -> Path:
     return path
 
 
-def _cdfs(path: Path, curves: Mapping[str, Mapping[str, SensorErrors]], title: str) -> Path:
-    """Draw the empirical distribution of the position error with a panel for each sensor."""
+def _cdfs(
+    path: Path,
+    curves: Mapping[str, Mapping[str, SensorErrors]],
+    title: str,
+    *,
+    is_ordered: bool = False,
+) -> Path:
+    """Draw the distribution of the position error with a panel for each sensor; curves that are
+    ordered have the colours of a scale.
+    """
+    scale = plt.get_cmap('viridis')(np.linspace(0.0, 0.9, len(curves)))
     figure, panels = plt.subplots(1, 2, figsize=(9, 3.8), sharey=True, layout='constrained')
     for panel, (sensor, words) in zip(panels, SENSOR_WORDS.items(), strict=True):
         medians: list[float] = []
         largest = 0.0
-        for name, errors in curves.items():
+        for rank, (name, errors) in enumerate(curves.items()):
             distance = np.sort(1e3 * errors[sensor].distance)
             distance = distance[np.isfinite(distance)]
             if distance.size == 0:
@@ -85,7 +95,8 @@ def _cdfs(path: Path, curves: Mapping[str, Mapping[str, SensorErrors]], title: s
             middle = float(np.median(distance))
             hides = any(abs(middle - other) < SAME * other for other in medians)
             style = {'ls': (0, (4, 4)), 'lw': 2.5} if hides else {}
-            panel.step(distance, share, where='post', label=name, **style)
+            color = scale[rank] if is_ordered else f'C{rank}'
+            panel.step(distance, share, where='post', label=name, color=color, **style)
             medians.append(middle)
             largest = max(largest, distance[-1])
         if medians and largest > 20.0 * min(medians):
