@@ -99,62 +99,55 @@ def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> tuple[dict
     """
     if form not in FORMATS:
         raise ParameterError(f'format must be among {", ".join(FORMATS)}, got {form!r}')
-    salvage = Salvage()
-    written: dict[str, int] = {}
+    salvage, tables = Salvage(), dict[str, tuple[int, dict[str, NDArray[Any]]]]()
     for topic, poses in sorted(published_poses(path, salvage=salvage).items()):
         stem = topic.strip('/').removeprefix('anser/').removesuffix('/pose').replace('/', '_')
-        name = f'{stem}.{"txt" if form == TUM else form}'
-        _write_poses(out / name, poses, form)
-        written[name] = int(poses.stamp_ns.size)
-        if written[name] > MOST_ALIKE * len(np.unique(poses.stamp_ns)):
+        tables[stem] = poses.stamp_ns.size, _pose_columns(poses, form)
+        if poses.stamp_ns.size > MOST_ALIKE * len(np.unique(poses.stamp_ns)):
             salvage.add(f'several poses of {topic} have each stamp: cut to seconds?')
-    if form != TUM:
-        for which, fluxes in read_fluxes(path).items():
-            name = f'{which}_flux.{form}'
-            _write_fluxes(out / name, fluxes, form)
-            written[name] = int(fluxes.stamp_ns.size)
-    if not written:
+    for which, fluxes in read_fluxes(path).items() if form != TUM else ():
+        tables[f'{which}_flux'] = fluxes.stamp_ns.size, _flux_columns(fluxes, form)
+    if not tables:
         words = f'nothing to export as {form}; there are: {salvage.topic_words()}'
         raise BagError(f'{os.fspath(path)}: {words}')
-    return written, salvage.lost
+    names = {stem: f'{stem}.{"txt" if form == TUM else form}' for stem in tables}
+    for stem, (_, columns) in tables.items():
+        _write(out / names[stem], columns, form)
+    return {names[stem]: int(count) for stem, (count, _) in tables.items()}, salvage.lost
 
 
-def _write_poses(path: Path, poses: PoseStream, form: str) -> None:
-    """A table of stamps, positions, m, and quaternions."""
+def _pose_columns(poses: PoseStream, form: str) -> dict[str, NDArray[Any]]:
+    """Stamps, in TUM s, positions, m, and quaternions."""
+    stamps, places, turns = poses.stamp_ns, poses.position, poses.quaternion
     if form == MAT:
-        stamps, places, turns = poses.stamp_ns, poses.position, poses.quaternion
-        _write_mat(path, stamp_ns=stamps, position_m=places, quaternion_xyzw=turns)
-        return
-    parts = poses.stamp_ns // SECOND_NS, poses.stamp_ns % SECOND_NS
-    seconds = [f'{s}.{ns:09d}' for s, ns in zip(*parts, strict=True)]
-    numbers = np.column_stack([poses.position, poses.quaternion])
-    _write_text(path, [seconds if form == TUM else poses.stamp_ns, *numbers.T], POSE_COLUMNS, form)
+        return {'stamp_ns': stamps, 'position_m': places, 'quaternion_xyzw': turns}
+    if form == TUM:
+        parts = zip(*divmod(stamps, SECOND_NS), strict=True)
+        stamps = np.array([f'{s}.{ns:09d}' for s, ns in parts])
+    return dict(zip(POSE_COLUMNS, (stamps, *places.T, *turns.T), strict=True))
 
 
-def _write_fluxes(path: Path, fluxes: RecordedFluxes, form: str) -> None:
-    """A table of stamps, channels, flags and phasors, T."""
+def _flux_columns(fluxes: RecordedFluxes, form: str) -> dict[str, NDArray[Any]]:
+    """Stamps, channels, flags and phasors, T: of tables a row for each channel of a frame."""
+    stamps, channel, flux = fluxes.stamp_ns, fluxes.channel, fluxes.flux
     if form == MAT:
-        flux = {'flags': fluxes.flags, 'flux_t': fluxes.flux}
-        _write_mat(path, stamp_ns=fluxes.stamp_ns, channel=fluxes.channel, **flux)
-        return
-    frames, channels, coils = fluxes.flux.shape
-    parts = np.ascontiguousarray(fluxes.flux).view(np.float64).reshape(-1, 2 * coils)
+        return {'stamp_ns': stamps, 'channel': channel, 'flags': fluxes.flags, 'flux_t': flux}
+    frames, channels, coils = flux.shape
+    parts = np.ascontiguousarray(flux).view(np.float64).reshape(-1, 2 * coils)
     names = [f'coil{k}_{part}_t' for k in range(coils) for part in ('re', 'im')]
-    stamps, channel = fluxes.stamp_ns.repeat(channels), np.tile(fluxes.channel, frames)
-    columns = [stamps, channel, fluxes.flags.ravel(), *parts.T]
-    _write_text(path, columns, ('stamp_ns', 'channel', 'flags', *names), form)
+    columns = {'stamp_ns': stamps.repeat(channels), 'channel': np.tile(channel, frames)}
+    return {**columns, 'flags': fluxes.flags.ravel(), **dict(zip(names, parts.T, strict=True))}
 
 
-def _write_text(path: Path, columns: Sequence[Any], names: Sequence[str], form: str) -> None:
-    """A table with commas and a header, or of TUM with neither."""
+def _write(path: Path, columns: Mapping[str, NDArray[Any]], form: str) -> None:
+    """A file of MATLAB, a table with commas and a header, or one of TUM with neither."""
+    if form == MAT:
+        from scipy.io import savemat
+
+        savemat(path, dict(columns), do_compression=True, oned_as='column')
+        return
     import pandas  # late: it takes half a second
 
     layout = {'sep': ' ', 'header': False} if form == TUM else {'lineterminator': '\r\n'}
-    frame = pandas.DataFrame(dict(zip(names, columns, strict=True)))
+    frame = pandas.DataFrame(dict(columns))
     frame.to_csv(path, index=False, float_format='%.9g', na_rep='nan', **layout)
-
-
-def _write_mat(path: Path, **arrays: NDArray[Any]) -> None:
-    from scipy.io import savemat
-
-    savemat(path, arrays, do_compression=True, oned_as='column')
