@@ -23,7 +23,7 @@ from anser_ros import (
     write_session,
 )  # fmt: skip
 from anser_ros.api.given import shown
-from anser_ros.errors import BagError, FitError, ParameterError, SetupError
+from anser_ros.errors import BagError, FitError, ParameterError, PlausibilityError, SetupError
 
 MODULES = (
     pytest.param('calibration', marks=pytest.mark.long),
@@ -189,6 +189,8 @@ def test_what_is_none_is_refused(tmp_path):
         (lambda s, m: simulate(SETUP, 5), 'times, positions and quaternions'),
         (lambda s, m: simulate(SETUP, {}), 'poses at the same times of pen'),
         (lambda s, m: simulate(SETUP, poses(2), -1.0), 'noise must be T'),
+        (lambda s, m: simulate(SETUP, poses(2), seed='a'), 'seed must be a whole number'),
+        (lambda s, m: track(s, m, baseline=s), 'a baseline is of a refit'),
     ],
 )
 def test_what_is_of_another_type_is_refused_in_words(call, said):
@@ -201,13 +203,16 @@ def test_a_simulation_measures_the_field_of_its_model():
     """Without noise it is the flux of the model; sessions and models may be given as they are."""
     times, position, turn = poses(3)
     model = Model.nominal(SETUP)
-    session = simulate(SETUP, (times, position + [0.0, 0.02, 0.1], turn), 0.0, model=model)
+    path = times, position + [0.0, 0.02, 0.1], turn
+    session = simulate(SETUP, path, 0.0, model='nominal')
+    with pytest.raises(PlausibilityError, match='lie 100 m from the board'):
+        simulate(SETUP, (times, position + [0.0, 20.0, 98.0], turn))
     (tool,), place = session.tools, [[0.0, 0.02, 0.1]] * 3
     np.testing.assert_allclose(tool.flux[:, 0], model.flux(place, [[1.0, 0.0, 0.0]] * 3))
     np.testing.assert_allclose(model.field(place)[:, 0], tool.flux[:, 0])
     np.testing.assert_allclose(session.reference.flux[0, 0], model.field([0.0, 0.0, 0.1])[2])
     assert Model.load(model.field) == model
-    path = times, position + [0.0, 0.02, 0.1], turn
+    assert model.field(np.zeros((0, 3))).shape == (0, *model.field(place).shape[1:])
     noisy = [simulate(SETUP, path, 1e-9, seed=s).tools[0].flux for s in range(40)]
     assert np.std(noisy, axis=0).mean() == pytest.approx(1.4e-9, rel=0.2)
     assert max(len(repr(one)) for one in (session, session.setup, tool, model, model.field)) < 200

@@ -183,10 +183,8 @@ def test_another_number_of_emitters_than_the_setups_is_refused(tmp_path):
 
 def test_a_chunk_that_declares_too_much_is_never_unpacked(whole, tmp_path, monkeypatch):
     """With a small bound, a bag whose chunks are larger gives nothing, and says so."""
-    monkeypatch.setattr('anser_ros.wire.bag_files._RECORD_LIMIT', 1000)
-    monkeypatch.setattr(
-        'anser_ros.wire.bag_files.breakup_chunk', None
-    )  # would fail if it were called
+    for name, value in (('_RECORD_LIMIT', 1000), ('breakup_chunk', None)):  # None is not called
+        monkeypatch.setattr(f'anser_ros.wire.bag_files.{name}', value)
     salvage = Salvage()
     with pytest.raises(BagError, match='no message can be read'):
         list(iter_messages(whole, salvage))

@@ -32,12 +32,12 @@ DIALECTS = {
     'tab': text_of('\t'),
     'tab and decimal comma': text_of('\t', comma=True),
     'blanks': text_of(' '),
-    'blanks in columns': text_of('   '),
     'blanks and decimal comma': text_of('  ', comma=True),
     'a blank behind the comma': text_of(', '),
     'quotes': text_of('","').replace('\n', '"\n"')[:-1].join(['"', '']),
     'CRLF': PLAIN.replace('\n', '\r\n'),
     'bars': text_of('|'),
+    'minus signs of typography': PLAIN.replace('-', '\N{MINUS SIGN}'),
     'capitals': PLAIN.upper().replace('E-', 'e-'),
     'empty rows at the end': PLAIN + ',,,,,,,\n,,,,,,,\n\n',
     'a separator behind every row': PLAIN.replace('\n', ',\n'),
@@ -125,14 +125,10 @@ def test_dates_are_times(tmp_path, form):
     np.testing.assert_allclose(session.sensors['poses'].time, 0.25 * np.arange(12), atol=1e-6)
 
 
+ANGLES = ['roll', 'pitch', 'yaw']
 MATRIX = [(*np.eye(4)[:3].ravel(),)] * 9
 REFUSED = {
-    'angles': (
-        text_of(',', [*NAMES[:4], 'roll', 'pitch', 'yaw', 'rms']), 'roll, pitch, yaw are no'
-    ),
-    'a rotation vector': (
-        text_of(',', [*NAMES[:4], 'rx_deg', 'ry_deg', 'rz_deg', 'n']), 'rx_deg, ry_deg, rz_deg'
-    ),
+    'angles': (text_of(',', [*NAMES[:4], *ANGLES, 'rms']), 'rms: angles are not read, give'),
     'q0 to q3': (text_of(',', [*NAMES[:4], 'q0', 'q1', 'q2', 'q3']), 'q0, q1, q2, q3 are no'),
     'letters': (text_of(',', list('abcdefgh')), 'no position x, y, z'),
     'a counter': (text_of(',', ['frame', *NAMES[1:]]), 'no time'),
@@ -156,16 +152,12 @@ REFUSED = {
     ),
     'a matrix': (rows_of('', *MATRIX, separator=' '), '12 numbers a line'),
     'seven numbers': (rows_of('', *(r[1:] for r in ROWS), separator=' '), '7 numbers a line'),
-    'nine numbers': (rows_of('', *((*r, 1) for r in ROWS), separator=' '), '9 numbers a line'),
     'a station number': (
         rows_of('', *((1, *r[1:]) for r in ROWS), separator=' '), 'all 12 times are 1 s'
     ),
     'times that fall': (
         rows_of('', *((9 - k % 3, *r[1:]) for k, r in enumerate(ROWS)), separator=' '),
         'the times do not ascend',
-    ),
-    'stamps that are never set': (
-        rows_of('time,x,y,z,qx,qy,qz,qw', *((0, *r[1:]) for r in ROWS)), 'all 12 times are 0 s'
     ),
     'the time of the day': (
         rows_of('time,x,y,z,qx,qy,qz,qw', *((f'08:53:{k}', *r[1:]) for k, r in enumerate(ROWS))),
@@ -181,9 +173,9 @@ REFUSED = {
         rows_of('t,x,y,z,qx,qy,qz,qw', *((3842844800.5 + r[1], *r[1:]) for r in ROWS)),
         'since 1904 (LabVIEW)? start_ns: -2082844800000000000',
     ),
-    '1900': (
-        rows_of('t,x,y,z,qx,qy,qz,qw', *((3968988800.5 + r[1], *r[1:]) for r in ROWS)),
-        'since 1900 (NTP)? start_ns: -2208988800000000000',
+    'half of the quaternions zero': (
+        text_of(',', rows=[r if k % 2 else (*r[:4], 0, 0, 0, 0) for k, r in enumerate(ROWS)]),
+        '6 of 12 quaternions are zero',
     ),
     'days': (
         rows_of('', *((739899.3 + 2.9e-7 * k, *r[1:]) for k, r in enumerate(ROWS)), separator=' '),
@@ -200,7 +192,6 @@ REFUSED = {
         'RX, RY, RZ are no quaternion',
     ),
     'no text': ('\0\1\2\3' * 40, 'not a text'),
-    'words': ('some words\nand more\n', 'no row of numbers'),
 }  # fmt: skip
 
 
@@ -253,16 +244,18 @@ def test_bodies_side_by_side_and_rows_that_are_no_pose(tmp_path):
     np.testing.assert_allclose(sensors['pen'].position[-1], [0.008, 0.002, 0.003])
     np.testing.assert_allclose(sensors['pen'].missing, [0.04])
     np.testing.assert_allclose(sensors['board'].quaternion, 9 * [[0, 0, 1, 0]])
-    text = text_of(',', [*NAMES, 'tool', 'valid'], [(*r, 7, k % 3) for k, r in enumerate(ROWS)])
+    rows = [(*r, 7, k % 3, 'OK' if k else 'Out of volume') for k, r in enumerate(ROWS)]
+    rows[1] = (START + 1, -9999, -9999, -9999, 0, 0, 0, 1, *rows[1][8:])
+    text = text_of(',', [*NAMES, 'tool', 'Tracking Valid', 'status'], rows)
     (tmp_path / 'b.csv').write_text(text)
     poses = import_poses([tmp_path / 'b.csv']).sensors['sensor_7']
-    assert poses.size == 8 and poses.missing.size == 4
+    assert poses.size == 7 and poses.missing.size == 5
 
 
 @pytest.mark.parametrize('text', [
     'x_mm,y_mm,z_mm\n0,0,0\n60,40,0\n', 'X_mm; Y_mm; Z_mm\n0,0;0,0;0,0\n60,0;40,0;0,0\n;;\n',
     'id,x (cm),y (cm),z (cm)\n1,0,0,0\n2,6,4,0\n', 'x\ty\tz\nmm\tmm\tmm\n0\t0\t0\n60\t40\t0\n',
-    'x_um,y_um,z_um\n0,0,0\n60000,40000,0\n',
+    'x_um,y_um,z_um\n0,0,0\n60000,40000,0\n', 'x_dm,y_dm,z_dm\n0,0,0\n0.6,0.4,0\n',
     'x_mm\ty_mm\tz_mm\n\t0\t0\n60\t40\t0\n', 'x_mm,y_mm,z_mm\n"0,060",0,0\n60,40,0\n',
 ])  # fmt: skip
 def test_places_of_any_unit(tmp_path, text):
@@ -286,14 +279,14 @@ def test_places_of_any_unit(tmp_path, text):
     ],
 )  # fmt: skip
 def test_lists_of_points_in_their_coordinate_system(tmp_path, name, text):
-    for system, sign in (('RAS', 1), ('LPS', -1), *([('0', 1), ('1', -1)] if 'f' in name else [])):
+    for system, sign in (('RAS', 1), ('LPS', -1), ('lps', -1), ('0', 1), ('1', -1)):
         (tmp_path / name).write_text(text.format(system, sign, 2 * sign, 5 * sign, sign))
         np.testing.assert_allclose(
             read_points(tmp_path / name), [[1e-3, 2e-3, 3e-3], [5e-3, 1e-3, 3e-3]]
         )
-    with pytest.raises(ParameterError, match='no list of points of 3D Slicer'):
-        (tmp_path / 'a.mrk.json').write_text('{}')
-        read_points(tmp_path / 'a.mrk.json')
+    (tmp_path / name).write_text(text.format('IJK', 1, 2, 3, 4) if 'f' in name else '{}')
+    with pytest.raises(ParameterError, match=r'save them in RAS|no list of points of 3D Slicer'):
+        read_points(tmp_path / name)
 
 
 @pytest.mark.parametrize('sign', [' = ', ':='])

@@ -82,7 +82,7 @@ def test_clouds_and_metal_have_their_boards_prefix(ros):
     finally:
         node.destroy_node()
     cloud = PointCloud2()
-    for frame, said in (('left_fg', 'no stamp'), ('base', "frame 'base'")):
+    for frame, said in (('left_fg', 'no stamp'), ('base', "frame 'base'"), ('wfg', "'wfg'")):
         cloud.header.frame_id = frame
         with pytest.raises(LayoutError, match=said):
             read_frame(cloud, 'fg', lambda *_: None)

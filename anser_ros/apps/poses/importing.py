@@ -3,11 +3,12 @@
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 
-from anser_ros.apps.poses.forms import FARTHEST_M, ORDERS, RawRows, read_form
+from anser_ros.apps.poses.forms import FARTHEST_M, ORDERS, read_form
 from anser_ros.apps.poses.sequence import (
     FARTHEST,
     REFERENCE,
@@ -69,20 +70,12 @@ def import_poses(
         )
     recordings: list[dict[str, Array]] = []
     lost: list[str] = []
-    for number, path in enumerate(tracked):
-        rows, unread = read_form(path)
-        groups, files = _named(path, rows, None, unit, quaternion), [(path, unread)]
-        if reference:
+    for path, other in zip_longest(tracked, reference):
+        groups = _named(path, None, unit, quaternion, lost)
+        if other is not None:
             if REFERENCE in groups:  # a file that says nothing of its sensor
                 groups['sensor_0'] = groups.pop(REFERENCE)
-            rows, unread = read_form(reference[number])
-            groups |= _named(reference[number], rows, REFERENCE, None, None)
-            files.append((reference[number], unread))
-        words = 'lines of {} that are no poses, and are left out: {}'
-        lost += [words.format(*one) for one in files if one[1]]
-        for label, table in groups.items():
-            if not np.isfinite(table[:, :2]).any():
-                raise ParameterError(f'{path}: {label}: no pose has a time')
+            groups |= _named(other, REFERENCE, None, None, lost)
         recordings.append(groups)
     pieces = _placed(recordings, stamps, shift_s)
     called = _called([piece[0] for piece in pieces], names or {})
@@ -153,31 +146,30 @@ def _runs_on(before: float, after: float, elapsed: float) -> bool:
 
 
 def _named(
-    path: Path,
-    rows: Mapping[str, RawRows],
-    name: str | None,
-    unit: str | None,
-    quaternion: str | None,
+    path: Path, name: str | None, unit: str | None, quaternion: str | None, lost: list[str]
 ) -> dict[str, Array]:
-    """Each group of rows (n, 9) under its name, with positions in m and quaternions x y z w."""
+    """Each group of a file's rows (n, 9) under its name, with positions in m and quaternions
+    x y z w; what is left out is added to what is lost.
+    """
+    rows, unread = read_form(path)
+    if unread:
+        lost.append(f'lines of {path} that are no poses, and are left out: {unread}')
     if name is not None:  # of an optical file only the tool with most poses is the reference
         most = max(rows.values(), key=lambda one: np.isfinite(one.table[:, 2:]).all(1).sum())
         rows = {name: most}
     found = {}
     for label, one in rows.items():
         table = one.table
+        if not np.isfinite(table[:, :2]).any():
+            raise ParameterError(f'{path}: {label}: no pose has a time')
         order, sense = ORDERS[quaternion or one.form]
         away = np.linalg.norm(table[:, 2:5], axis=1)
-        if (
-            not (unit or one.unit)
-            and np.nanmedian(np.where(away < FARTHEST, away, np.nan)) > FARTHEST_M
-        ):
-            raise ParameterError(
-                f'{path}: {label}: positions of {np.nanmedian(away):.4g} state no unit: --unit mm?'
-            )
+        middle = np.median(away[away < FARTHEST]) if (away < FARTHEST).any() else 0.0
+        if middle > FARTHEST_M and not (unit or one.unit):
+            words = f'positions of {middle:.4g} state no unit'
+            raise ParameterError(f'{path}: {label}: {words}: --unit mm?')
         table[:, 2:5] *= LENGTH_M[unit or one.unit or 'm']
-        table[:, 5:] = table[:, 5:][:, list(order)]
-        table[:, 5:8] *= sense
+        table[:, 5:] = table[:, 5:][:, list(order)] * [sense, sense, sense, 1.0]
         found[label] = table
     return found
 
@@ -187,31 +179,26 @@ def _times(tables: Sequence[Array], stamps: str) -> list[tuple[Array, bool]]:
 
     A device's counter that runs on has one zero on that axis, whose drift is its clock's rate.
     """
-    out, pieces = [], []
+    out: list[tuple[Array, bool]] = []
+    zero, last = 0.0, None
     for table in tables:
         host, device = table[:, 0], table[:, 1].copy()
         if not np.isfinite(host).any():
             out.append((_continued(device), False))
             continue
-        if stamps == 'host' or not np.isfinite(device).any():
-            out.append((host, True))
-            continue
-        out.append((device, True))
+        is_counted = stamps == 'device' and np.isfinite(device).any()
+        out.append((device if is_counted else host, True))
         order = np.argsort(host, kind='stable')  # lines may be in another order than they came
         count = _restarts(device[order])
-        for number in np.unique(count):
+        for number in np.unique(count) if is_counted else ():
             rows = order[count == number]
-            late = host[rows] - device[rows]
-            if np.isfinite(late).any():
-                pieces.append(
-                    (device, rows, float(np.nanmin(late)), float(np.nanmin(device[rows])))
-                )
-    zero, last = 0.0, None
-    for device, rows, late, begin in pieces:
-        if last is None or not _runs_on(last[0], late, begin - last[1]):
-            zero = late
-        last = late, begin
-        device[rows] += zero
+            if not np.isfinite(late := host[rows] - device[rows]).any():
+                continue
+            apart, begin = float(np.nanmin(late)), float(np.nanmin(device[rows]))
+            if last is None or not _runs_on(last[0], apart, begin - last[1]):
+                zero = apart
+            last = apart, begin
+            device[rows] += zero
     return out
 
 
