@@ -14,7 +14,7 @@ from anser_ros.errors import BagError, ParameterError
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag import Salvage, iter_messages, published_poses, read_fluxes
 from anser_ros.wire.bag_writer import SessionWriter
-from anser_ros.wire.recorded import SETUP_TYPE, PoseStream, RecordedFluxes
+from anser_ros.wire.recorded import MOST_ALIKE, SETUP_TYPE, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import parse_setup
 
 
@@ -85,7 +85,6 @@ def import_bag(
     return ImportedBag(dict(written), dict(left_out), salvage.lost)
 
 
-MOST_ALIKE = 2.5  # poses with the same stamp from which on stamps are not those of the poses
 CSV, TUM, MAT = 'csv', 'tum', 'mat'
 FORMATS = (CSV, TUM, MAT)
 """Forms of files; TUM, which `evo` reads, has poses only."""

@@ -41,6 +41,8 @@ MAGIC = b'\x89MCAP0\r\n'
 """How a file of MCAP begins and ends."""
 HEADER = b'\x01'
 """What follows at its begin: the opcode of its header."""
+CHUNK = b'\x06'
+"""Opcode of a chunk."""
 PAGE = 4096
 """Bytes that sqlite3 writes as one, by default."""
 LOGGED = b'\2'
@@ -96,7 +98,22 @@ def _streamed(stream: io.BufferedReader, salvage: Salvage, size: int) -> list[Fo
     """The messages of a bag without index, chunk by chunk, as far as it can be read."""
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
-    messages, whole, bad_chunks = [], 0, 0
+    messages = []
+    for one in _records(stream, salvage, size):
+        if isinstance(one, Schema):
+            schemas[one.id] = one
+        elif isinstance(one, Channel):
+            channels[one.id] = one
+        elif isinstance(one, Message) and one.channel_id in channels:
+            channel = channels[one.channel_id]
+            schema = schemas.get(channel.schema_id)
+            messages.append((schema, channel, one.log_time, one.data))
+    return sorted(messages, key=itemgetter(2))
+
+
+def _records(stream: io.BufferedReader, salvage: Salvage, size: int) -> Iterator[Any]:
+    """The records of a bag in and between chunks, to where it breaks off."""
+    whole, bad_chunks = 0, 0
     try:
         reader = StreamReader(stream, emit_chunks=True, record_size_limit=_RECORD_LIMIT)
         for record in reader.records:
@@ -105,21 +122,26 @@ def _streamed(stream: io.BufferedReader, salvage: Salvage, size: int) -> list[Fo
                 break
             inner, bad = _unchunked(record)
             bad_chunks += bad
-            for one in inner:
-                if isinstance(one, Schema):
-                    schemas[one.id] = one
-                elif isinstance(one, Channel):
-                    channels[one.id] = one
-                elif isinstance(one, Message) and one.channel_id in channels:
-                    channel = channels[one.channel_id]
-                    schema = schemas.get(channel.schema_id)
-                    messages.append((schema, channel, one.log_time, one.data))
+            yield from inner
     except _BROKEN as error:
         why = ': '.join(filter(None, (type(error).__name__, ' '.join(str(error).split())[:120])))
         salvage.add(f'the bag breaks off after {whole} of {size} bytes ({why})')
+        stream.seek(whole)
+        yield from _rest_of_chunk(stream.read(_RECORD_LIMIT))
     if bad_chunks:
         salvage.add(f'{bad_chunks} chunks with a bad checksum or size left out')
-    return sorted(messages, key=itemgetter(2))
+
+
+def _rest_of_chunk(data: bytes) -> Iterator[Any]:
+    """The records in a chunk that breaks off, as far as they can be unpacked."""
+    size = int.from_bytes(data[37:41], 'little')  # of the compression's name
+    form, packed = data[41 : 41 + size], data[49 + size :]
+    if data[:1] != CHUNK or form not in (b'', b'zstd'):
+        return
+    with suppress(*_BROKEN):
+        if form:
+            packed = zstandard.ZstdDecompressor().stream_reader(packed).read(_RECORD_LIMIT)
+        yield from StreamReader(io.BytesIO(packed), skip_magic=True).records
 
 
 def _unchunked(record: Any) -> tuple[list[Any], bool]:

@@ -28,6 +28,7 @@ def unit_quaternions(given: ArrayLike) -> Array:
     return np.asarray(unit)
 
 
+MOST_ALIKE = 2.5  # poses with the same stamp from which on stamps are not those of the poses
 MOST_ZERO = 0.5
 """Share of zero quaternions, a tracker's mark for no pose, from which on a table has no poses:
 what was not seen half of the time is no recording, and columns of another meaning are zero."""

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from anser_ros.arrays import AnyArray, Array, Booleans
 from anser_ros.errors import DiagnosisError, PlausibilityError
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
-from anser_ros.sessions.import_export import MOST_ALIKE
 from anser_ros.stamps import NANO, Order, order_of
+from anser_ros.wire.recorded import MOST_ALIKE
 
 REFERENCE = 'optical'  # name of the reference among a session's streams
 FARTHEST = 1e6
