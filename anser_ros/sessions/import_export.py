@@ -14,7 +14,7 @@ from anser_ros.errors import BagError, ParameterError
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag import Salvage, iter_messages, published_poses, read_fluxes
 from anser_ros.wire.bag_writer import SessionWriter
-from anser_ros.wire.recorded import MOST_ALIKE, SETUP_TYPE, PoseStream, RecordedFluxes
+from anser_ros.wire.recorded import MOST_ALIKE, POSE_TYPES, SETUP_TYPE, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import parse_setup
 
 
@@ -99,11 +99,19 @@ def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> tuple[dict
     if form not in FORMATS:
         raise ParameterError(f'format must be among {", ".join(FORMATS)}, got {form!r}')
     salvage, tables = Salvage(), dict[str, tuple[int, dict[str, NDArray[Any]]]]()
-    for topic, poses in sorted(published_poses(path, salvage=salvage).items()):
+    found = published_poses(path, salvage=salvage)
+    # Transforms of our own poses, and these with their covariance, are there besides.
+    known = *found, '/tf'
+    held = (t for t, kind in salvage.topics.items() if kind in POSE_TYPES)
+    if rest := [topic for topic in held if not topic.startswith(known)]:
+        salvage.add(f'{", ".join(rest)} left out, as there are PoseStamped')
+    for topic, poses in sorted(found.items()):
         stem = topic.strip('/').removeprefix('anser/').removesuffix('/pose').replace('/', '_')
         tables[stem] = poses.stamp_ns.size, _pose_columns(poses, form)
         if poses.stamp_ns.size > MOST_ALIKE * len(np.unique(poses.stamp_ns)):
-            salvage.add(f'several poses of {topic} have each stamp: cut to seconds?')
+            salvage.add(
+                f'several poses of {topic} have each stamp: cut to seconds, or played again?'
+            )
     for which, fluxes in read_fluxes(path).items() if form != TUM else ():
         tables[f'{which}_flux'] = fluxes.stamp_ns.size, _flux_columns(fluxes, form)
     if not tables:

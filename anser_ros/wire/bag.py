@@ -270,16 +270,14 @@ def published_poses(
     for topic in [t for t in rows if topics is not None or not plain or t in plain]:
         table = np.array([numbers for *_, numbers in rows[topic]]).reshape(-1, 7)
         times = np.array([row[:2] for row in rows[topic]], dtype=np.int64).reshape(-1, 2)
-        unset = int(np.count_nonzero(times[:, 0] == 0)) if len(times) > 1 else 0
-        is_unset = 0 < unset == len(times)
-        if unset:
-            count = f'all {unset}' if is_unset else f'{unset} of {len(times)}'
-            remedy = 'the times of recording stand in' if is_unset else 'these poses are left out'
-            salvage.add(
-                f'{count} stamps of {topic} are 0: the driver does not set header.stamp, and '
-                f'{remedy}'
-            )
-        keep = slice(None) if is_unset or not unset else times[:, 0] != 0
-        stamps, table = times[keep, int(is_unset)], table[keep]
-        found[topic] = recorded.PoseStream(stamps, table[:, :3], table[:, 3:])
+        unset = times[:, 0] == 0
+        if len(times) > 1 and unset.any():
+            count = f'{unset.sum()} of {len(times)}'
+            remedy = 'these poses are left out'
+            if is_never := unset.all():
+                count, remedy = f'all {len(times)}', 'the times of recording stand in'
+            words = 'the driver does not set header.stamp'
+            salvage.add(f'{count} stamps of {topic} are 0: {words}, and {remedy}')
+            times, table = times[~unset | is_never, int(is_never) :], table[~unset | is_never]
+        found[topic] = recorded.PoseStream(times[:, 0], table[:, :3], table[:, 3:])
     return found
