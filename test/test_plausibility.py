@@ -18,6 +18,7 @@ from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.plausibility import FLUX_UNITS, LENGTH_UNITS, check_points, plausible_tools
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
+from anser_ros.sessions.tracked_session import track_session
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.bag_writer import SessionWriter
 
@@ -61,6 +62,11 @@ def says(session, tool, *words, refused=None):
 def test_what_is_right_passes_unchanged(moving, tool):
     same, left_out = checked(moving, tool)
     assert same is tool and left_out == '' and moving.lost == ''
+    flux = tool.flux.copy()
+    flux[:, :, 1], flux[5] = 0.0, np.nan
+    count, name = len(flux), moving.setup.emitter_names[1]
+    words = f'all fluxes of {name} are zero; fluxes of {tool.body} are not finite in 1 of {count}'
+    assert words in checked(moving, replace(tool, flux=flux))[1]
 
 
 @pytest.mark.parametrize('unit', LENGTH_UNITS)
@@ -165,9 +171,10 @@ def test_a_diagnosis_of_one_pose_ends_at_once(moving, tool):
     )
     with pytest.raises(DiagnosisError, match='optical poses are the same'):
         diagnose_session(replace(moving, tools=(rest,)), load_model(MODEL))
-    large = replace(tool, flux=1e3 * tool.flux)
-    with pytest.raises(DiagnosisError, match=r'1e\+03 times what the model predicts'):
-        diagnose_session(replace(moving, tools=(large,)), load_model(MODEL))
+    large = replace(moving, tools=(replace(tool, flux=1e3 * tool.flux),))
+    for use in (diagnose_session, track_session):
+        with pytest.raises(PlausibilityError, match=r'times what the model makes .* millitesla'):
+            use(large, load_model(MODEL))
 
 
 def test_commands_say_it_in_one_line(tmp_path, capsys):

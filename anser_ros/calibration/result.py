@@ -175,7 +175,7 @@ def _population(result: SensorFit, kind: str) -> list[EffectRecord]:
     values, sigma = unit * found.values[rows], unit * found.sigma[rows]
     channels = np.concatenate([table.channel for table in parameters.tables])
     axes = np.concatenate([table.axis for table in parameters.tables])
-    alone = np.isin(rows[:, 0], result.alone[kind])
+    alone = np.isin(rows[:, 0], result.alone[kind]) | (len(rows) == 1)  # one has no population
     singles = [
         _single(kind, int(channels[i]), axes[i], values[i], sigma[i])
         for i in np.flatnonzero(alone)
@@ -204,6 +204,8 @@ def _population(result: SensorFit, kind: str) -> list[EffectRecord]:
         {'spread': float(width[0] * relative), 'values': sigma[keep].tolist()},
         _evidence(result, kind),
     )
+    if not keep.any():
+        return [replace(one, evidence=record.evidence) for one in singles]
     return [record, *singles]
 
 

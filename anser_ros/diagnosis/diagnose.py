@@ -23,7 +23,7 @@ from anser_ros.diagnosis.problem import (
     train_blocks,
 )
 from anser_ros.diagnosis.search import Progress, Search, SearchSettings, search_effects
-from anser_ros.diagnosis.wiring import check_size, wiring_faults
+from anser_ros.diagnosis.wiring import wiring_faults
 from anser_ros.effects.correction import Fields, changed_illumination
 from anser_ros.effects.effect import Family, Remedy, Term
 from anser_ros.effects.seen import EXCESS_NOISE, known_share, outliers_of
@@ -229,9 +229,7 @@ def diagnose(
 
 def screen(problem: Problem) -> Screened:
     """Name the faults of the wiring, and leave out dead channels and values that stand out."""
-    few = problem.thinned(WIRING_FRAMES)
-    check_size(few)
-    known = wiring_faults(few)
+    known = wiring_faults(problem.thinned(WIRING_FRAMES))
     whole = _without_dead(problem, known)
     return Screened(tuple(known), whole, whole if known else screening.clean_start(whole))
 

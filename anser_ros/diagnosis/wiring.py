@@ -25,7 +25,6 @@ from anser_ros.effects.seen import (
     SWAPPED_COILS,
 )
 from anser_ros.effects.sensors import BODY_TURNED
-from anser_ros.errors import DiagnosisError
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import along_each_axis
@@ -83,18 +82,6 @@ def wiring_faults(problem: Problem) -> list[Term]:
     return found
 
 
-def check_size(problem: Problem) -> None:
-    """Raise `DiagnosisError` where a tool reads many times what the model predicts for it."""
-    for tool, readings in zip(problem.tools, _read(problem, ()), strict=True):
-        least = max(float(_power(readings.wanted)), 1e-300)
-        ratio = float(np.sqrt(_power(readings.seen) / least))
-        if ratio > OTHER_UNIT:
-            raise DiagnosisError(
-                f'readings of {tool.body} are {ratio:.2g} times what the model predicts: another '
-                'unit, or another field generator?'
-            )
-
-
 def _read(problem: Problem, terms: Sequence[Term]) -> list[_Readings]:
     pairs = zip(problem.tools, problem.good, strict=True)
     return [_Readings.of(tool, good, terms, problem.fields) for tool, good in pairs]
@@ -140,8 +127,6 @@ def _rewired(problem: Problem, number: int, known: Sequence[Term]) -> list[Term]
     return list(min(alike, key=lambda way: way[1])[2])
 
 
-OTHER_UNIT = 100.0
-"""Readings over the model's from which on they are in another unit: no gain is so far off."""
 MOST_EXCHANGED = 12
 """Channels of a body up to which each pair is tried in each other's place: 66 pairs."""
 RIDGE = 1e-6

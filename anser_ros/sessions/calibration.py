@@ -354,9 +354,13 @@ def named_kinds() -> tuple[str, ...]:
 
 
 def check_same_board(sessions: list[Session]) -> None:
-    """Raise `FitError` when two sessions' setups have different emitters."""
-    first = sessions[0]
-    for other in sessions[1:]:
+    """Raise `FitError` when two sessions' setups have other emitters, or sensors of a body."""
+    first, stated = sessions[0], dict[str, str]()
+    for other in sessions:
+        for body in (tool.body for tool in other.tools):
+            own = other.setup.identity.bodies[body]
+            if stated.setdefault(body, own) != own:
+                raise FitError(f'{other.path} states other sensors of {body} than sessions before')
         if other.setup.emitter != first.setup.emitter:
             raise FitError(
                 f'all sessions must be of one board: {first.path} and {other.path} differ in '

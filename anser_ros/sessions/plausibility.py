@@ -16,6 +16,7 @@ import numpy as np
 from anser_ros.arrays import Array, Integers
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import FieldModel
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.refit.clouds import FieldFunction
 from anser_ros.sessions.nominal_board import NominalBoard, tracked_volume
@@ -129,7 +130,7 @@ def check_conventions(path: str, setup: Setup, nominal: NominalBoard, tool: Meas
     share, gain = fit(AS_WRITTEN) if len(rows) >= FEWEST_READINGS else (np.nan, np.nan)
     if share > GOOD:
         median = float(np.median(np.linalg.norm(tool.flux[rows, columns], axis=1)))
-        _check_flux(path, tool, median, gain, 'at its poses')
+        _check_flux(path, tool, median, gain, 'the drawn board makes at its poses')
         return
     for reading in OTHER_READINGS if share < POOR else ():
         better, _ = fit(reading)
@@ -179,14 +180,25 @@ def _fit(
     return float(np.mean(miss < MISFIT * np.linalg.norm(flux, axis=1))), gain
 
 
-def _check_flux(path: str, tool: Measurements, median: float, gain: float, where: str) -> None:
-    """Raise where fluxes are larger than the nominal board's by the factor of a unit."""
+def _check_flux(path: str, tool: Measurements, median: float, gain: float, what: str) -> None:
+    """Raise where fluxes are larger than what is expected by the factor of a unit."""
     if gain > TOO_LARGE:
         unit = unit_words(gain, FLUX_UNITS) or 'another unit than T'
         raise PlausibilityError(
-            f'{path}: fluxes of {tool.body} are {median:.3g} T, {gain:.2g} times what the drawn '
-            f'board makes {where}: {unit}?'
+            f'{path}: fluxes of {tool.body} are {median:.3g} T, {gain:.2g} times what {what}: '
+            f'{unit}?'
         )
+
+
+def check_unit(path: str, model: FieldModel, tool: Measurements) -> None:
+    """Raise `PlausibilityError` where a tool reads many times what a model has at its poses."""
+    rows, columns = _chosen(tool)
+    points, axes = (part[rows, columns] for part in tool.placed())
+    read, made = tool.flux[rows, columns], model.flux(points, axes)
+    size, expected = (np.linalg.norm(part, axis=1) for part in (read, made))
+    if len(rows) >= FEWEST_READINGS:
+        gain = float(np.median(size / np.maximum(expected, 1e-300)))
+        _check_flux(path, tool, float(np.median(size)), gain, 'the model makes at its poses')
 
 
 def _check_size(path: str, setup: Setup, drawn: FieldFunction, tool: Measurements) -> None:
@@ -198,7 +210,8 @@ def _check_size(path: str, setup: Setup, drawn: FieldFunction, tool: Measurement
     there = np.linalg.norm(drawn(tracked_volume(setup).samples(4, 3)), axis=(1, 2))
     if median > TOO_LARGE * float(there.max()):
         usual = float(np.median(there))
-        _check_flux(path, tool, median, median / usual, 'in the tracked volume')
+        what = 'the drawn board makes in the tracked volume'
+        _check_flux(path, tool, median, median / usual, what)
 
 
 FAR = 10.0
@@ -227,10 +240,16 @@ def plausible_tools(
     evidence, in one line.
     """
     nominal, kept, words = NominalBoard.of(setup), [], []
-    if tools and not any(np.nan_to_num(tool.flux).any() for tool in tools):
+    driven = [np.nan_to_num(tool.flux).any(axis=(0, 1)) for tool in tools]
+    silent = np.flatnonzero(~np.any(driven, axis=0)) if tools else ()
+    if len(silent) == len(setup.emitter_names):
         raise PlausibilityError(f'{path}: all fluxes of all tools are zero: an empty band?')
+    words += [f'all fluxes of {setup.emitter_names[k]} are zero' for k in silent]
     for tool in tools:
         words += _check_refused(path, tool, refused)
+        bad = ~np.isfinite(tool.flux).all(axis=2) & (tool.flags == 0)
+        if count := int(bad.any(axis=1).sum()):
+            words.append(f'fluxes of {tool.body} are not finite in {count} of {len(bad)} frames')
         _check_clocks(path, tool)
         thawed, remarks = _thawed(path, tool)
         words += remarks

@@ -15,6 +15,7 @@ from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.baseline import Baseline, clean_flux
 from anser_ros.sessions.nominal_board import NominalBoard, tracked_volume
+from anser_ros.sessions.plausibility import check_unit
 from anser_ros.sessions.session import Session, measured_noise, stamp_sigma, tracking_noise
 from anser_ros.sessions.starting_model import check_fits, is_recorded
 from anser_ros.tracking.estimate import TrackerSettings
@@ -83,10 +84,12 @@ def prepare(
 
     A baseline's readings are not used where the session has no reference fluxes. Raises
     `ModelFileError` when the model's emitters are not the session's or the baseline's, or an
-    effect of it is unknown; `BagError` when the baseline's references are not the session's, or
-    there is metal in it.
+    effect of it is unknown; `PlausibilityError` when fluxes are in another unit than the model's;
+    `BagError` when the baseline's references are not the session's, or there is metal in it.
     """
     check_fits(model, session)
+    for tool in session.tools:
+        check_unit(session.path, model, tool)
     model = as_it_stood(model, session)
     clean = None
     if baseline is not None:

@@ -196,7 +196,8 @@ def _without_disagreeing(fit: BodyFit, frame: BodyFrame, gate: float) -> BodyFit
         worst = int(np.argmax(misfit))
         others = np.delete(misfit, worst)
         rest = np.delete(fit.used, worst)
-        if len(rest) < 2 or not frame.coils.subset(rest).observable:
+        few = len(rest) * frame.context.readings <= UNKNOWNS  # they fit whatever they are
+        if few or len(rest) < 2 or not frame.coils.subset(rest).observable:
             break
         if misfit[worst] < DISAGREES * others.mean():
             break
