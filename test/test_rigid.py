@@ -1,5 +1,7 @@
 """Rigid tools: exact poses, cold starts, common model errors, coils that are left out."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from tracking_world import NOISE_T, certain_model, fluxes, random_pose, triaxial_tool
@@ -9,6 +11,7 @@ from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.physics.volume import TrackedVolume
+from anser_ros.tracking import body_track
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.rigid import BodyCoils, common_factor, solve_body, start_from_coils
 from anser_ros.tracking.solve import RealField, bounded_inverse
@@ -211,3 +214,10 @@ def test_the_opposite_place_around_a_source_is_ambiguous_where_nothing_tells_it(
         ]
         assert body.state == state
         assert state != 'ok' or np.linalg.norm(body.position - position) < 1e-3
+
+
+def test_a_body_with_no_readings_to_spare_leaves_no_coil_out():
+    few = SimpleNamespace(context=SimpleNamespace(readings=3))  # two coils have six
+    solution = SimpleNamespace(chi2=1e4, coil_chi2=np.array([1.0, 1.0, 1e4]))
+    fit = body_track.BodyFit(solution, np.arange(3), 3)
+    assert body_track._without_disagreeing(fit, few, 4.0) is fit

@@ -130,8 +130,6 @@ def _one_vector(rows: Rows, centre: Array) -> tuple[Array, Array]:
 
 UNIT_Z = np.array([0.0, 0.0, 1.0])
 """Direction of the dipoles of a flat layer, the normal of the board."""
-
-
 CLUSTER = np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
 """Places of a cluster's dipoles, in its spacing: three components in the middle and at six places
 around it make every dipole and quadrupole, and all octupoles but one."""
@@ -144,7 +142,6 @@ SAME_PLACE = 0.5
 
 def clusters(centres: Array, spacing_m: float) -> DipoleSites:
     """Return dipoles around emitters of any shape, with middles (K, 3), m, frame fg.
-
 
     Moments grow with the power of a source's size over the spacing: damping, which holds all of
     them alike, holds each multipole as much as a source of that size lets it be.

@@ -307,17 +307,9 @@ class SensorParameters:
         axis = table.axis if tilts is None else tilted(table.axis, tilts)
         place, lever = part('places', count, 3), part('lever_arm', 3)
         clock = [float(part(kind, 1)[0]) for kind in CLOCKS]
-        return BodyErrors(
-            gain,
-            turn,
-            axis,
-            place,
-            lever,
-            pickup,
-            clock[0] - clock[1] * self.middle_s,
-            clock[1],
-            *(self.stand(kind, body, session, values) for kind in STANDS),
-        )
+        offset_s = clock[0] - clock[1] * self.middle_s
+        stands = (self.stand(kind, body, session, values) for kind in STANDS)
+        return BodyErrors(gain, turn, axis, place, lever, pickup, offset_s, clock[1], *stands)
 
     def derivatives(
         self, part: Measurements, modelled: ComplexArray, by_place: ComplexArray,

@@ -361,20 +361,16 @@ def check_same_board(sessions: list[Session]) -> None:
             own = other.setup.identity.bodies[body]
             if stated.setdefault(body, own) != own:
                 raise FitError(f'{other.path} states other sensors of {body} than sessions before')
-        if other.setup.emitter != first.setup.emitter:
+        mine, theirs = first.setup.emitter, other.setup.emitter
+        if theirs != mine:
+            pairs = zip(mine.coils, theirs.coils, strict=False)
+            coils = (f'coil {a.name}: {a} and {b}' for a, b in pairs if a != b)
+            counts = f'the number of coils, {len(mine.coils)} and {len(theirs.coils)}'
+            alike = len(mine.coils) == len(theirs.coils)
             raise FitError(
                 f'all sessions must be of one board: {first.path} and {other.path} differ in '
-                f'{_difference(first.setup, other.setup)}'
+                f'{next(coils, "the geometry of the coils") if alike else counts}'
             )
-
-
-def _difference(one: Setup, other: Setup) -> str:
-    if len(one.emitter.coils) != len(other.emitter.coils):
-        return f'the number of coils, {len(one.emitter.coils)} and {len(other.emitter.coils)}'
-    for mine, theirs in zip(one.emitter.coils, other.emitter.coils, strict=True):
-        if mine != theirs:
-            return f'coil {mine.name}: {mine} and {theirs}'
-    return 'the geometry of the coils'
 
 
 def calibrate_sessions(

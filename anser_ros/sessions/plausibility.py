@@ -129,8 +129,8 @@ def check_conventions(path: str, setup: Setup, nominal: NominalBoard, tool: Meas
     fit = partial(_fit, field, tool, rows, columns)
     share, gain = fit(AS_WRITTEN) if len(rows) >= FEWEST_READINGS else (np.nan, np.nan)
     if share > GOOD:
-        median = float(np.median(np.linalg.norm(tool.flux[rows, columns], axis=1)))
-        _check_flux(path, tool, median, gain, 'the drawn board makes at its poses')
+        size = np.linalg.norm(tool.flux[rows, columns], axis=1)
+        _check_flux(path, tool, size, size / gain, 'the drawn board makes at its poses')
         return
     for reading in OTHER_READINGS if share < POOR else ():
         better, _ = fit(reading)
@@ -180,25 +180,25 @@ def _fit(
     return float(np.mean(miss < MISFIT * np.linalg.norm(flux, axis=1))), gain
 
 
-def _check_flux(path: str, tool: Measurements, median: float, gain: float, what: str) -> None:
+def _check_flux(
+    path: str, tool: Measurements, size: Array, expected: Array | float, what: str
+) -> None:
     """Raise where fluxes are larger than what is expected by the factor of a unit."""
-    if gain > TOO_LARGE:
+    if (gain := float(np.median(size / np.maximum(expected, 1e-300)))) > TOO_LARGE:
         unit = unit_words(gain, FLUX_UNITS) or 'another unit than T'
         raise PlausibilityError(
-            f'{path}: fluxes of {tool.body} are {median:.3g} T, {gain:.2g} times what {what}: '
-            f'{unit}?'
+            f'{path}: fluxes of {tool.body} are {np.median(size):.3g} T, {gain:.2g} times what '
+            f'{what}: {unit}?'
         )
 
 
 def check_unit(path: str, model: FieldModel, tool: Measurements) -> None:
     """Raise `PlausibilityError` where a tool reads many times what a model has at its poses."""
     rows, columns = _chosen(tool)
-    points, axes = (part[rows, columns] for part in tool.placed())
-    read, made = tool.flux[rows, columns], model.flux(points, axes)
-    size, expected = (np.linalg.norm(part, axis=1) for part in (read, made))
+    made = model.flux(*(part[rows, columns] for part in tool.placed()))
     if len(rows) >= FEWEST_READINGS:
-        gain = float(np.median(size / np.maximum(expected, 1e-300)))
-        _check_flux(path, tool, float(np.median(size)), gain, 'the model makes at its poses')
+        size, expected = (np.linalg.norm(f, axis=1) for f in (tool.flux[rows, columns], made))
+        _check_flux(path, tool, size, expected, 'the model makes at its poses')
 
 
 def _check_size(path: str, setup: Setup, drawn: FieldFunction, tool: Measurements) -> None:
@@ -206,12 +206,11 @@ def _check_size(path: str, setup: Setup, drawn: FieldFunction, tool: Measurement
     whole = np.isfinite(tool.flux).all(axis=2) & (tool.flags == 0)
     if not whole.any():
         return
-    median = float(np.median(np.linalg.norm(tool.flux[whole], axis=1)))
+    size = np.linalg.norm(tool.flux[whole], axis=1)
     there = np.linalg.norm(drawn(tracked_volume(setup).samples(4, 3)), axis=(1, 2))
-    if median > TOO_LARGE * float(there.max()):
-        usual = float(np.median(there))
+    if np.median(size) > TOO_LARGE * float(there.max()):
         what = 'the drawn board makes in the tracked volume'
-        _check_flux(path, tool, median, median / usual, what)
+        _check_flux(path, tool, size, float(np.median(there)), what)
 
 
 FAR = 10.0
