@@ -102,8 +102,8 @@ def test_what_a_scan_contained_is_shown_though_no_model_has_it(tmp_path, capsys,
 @pytest.mark.long
 def test_reference_sensors_take_no_part(factory):
     options = Options(layout=Layout('layer', 9, 1.25, 0.0))
-    without = replace(factory, reference=None)
-    models = [calibrate_sessions([s], options).model for s in (factory, without)]
+    sessions = factory, replace(factory, reference=None)
+    models = [calibrate_sessions([session], options).model for session in sessions]
     assert factory.reference is not None
     assert np.array_equal(models[0].moments, models[1].moments)
 
@@ -167,8 +167,7 @@ def test_a_model_worse_than_the_nominal_one_is_only_written_when_forced(factory,
     arguments = (bag, '--out', tmp_path / 'm.yaml', '--dipoles', '6x6')
     assert re.search("worse than the nominal model's.*--force", refusal(capsys, *arguments))
     assert not (tmp_path / 'm.yaml').exists()
-    assert calibrate(*arguments, '--force') == 0
-    assert (tmp_path / 'm.yaml').exists()
+    assert calibrate(*arguments, '--force') == 0 and (tmp_path / 'm.yaml').exists()
 
 
 def test_missing_folders_are_made_before_the_work(tmp_path, capsys, monkeypatch):
@@ -214,10 +213,8 @@ def test_a_board_of_unknown_kind_still_calibrates(factory):
     session = replace(factory, setup=replace(factory.setup, emitter=emitter))
     assert NominalBoard.of(session.setup).model is None
     assert generator_of(session.setup).side_m == pytest.approx(0.0969, abs=2e-3)
-    options = Options(layout=Layout('layer', 10, 1.25, 0.0))
-    found = calibrate_sessions([session], options)
-    assert found.nominal_rmse_t is None
-    assert found.better_than_nominal
+    found = calibrate_sessions([session], Options(layout=Layout('layer', 10, 1.25, 0.0)))
+    assert found.nominal_rmse_t is None and found.better_than_nominal
     assert found.residuals.rmse_t < 1e-9
 
 

@@ -55,8 +55,7 @@ def says(session, tool, *words, refused=None):
     with pytest.raises(PlausibilityError) as caught:
         checked(session, tool, refused)
     text = str(caught.value)
-    assert all(word in text for word in words), text
-    assert '\n' not in text
+    assert '\n' not in text and all(word in text for word in words), text
 
 
 def test_what_is_right_passes_unchanged(moving, tool):
