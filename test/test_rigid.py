@@ -216,8 +216,7 @@ def test_the_opposite_place_around_a_source_is_ambiguous_where_nothing_tells_it(
         assert state != 'ok' or np.linalg.norm(body.position - position) < 1e-3
 
 
-def test_a_body_with_no_readings_to_spare_leaves_no_coil_out():
-    few = SimpleNamespace(context=SimpleNamespace(readings=3))  # two coils have six
-    solution = SimpleNamespace(chi2=1e4, coil_chi2=np.array([1.0, 1.0, 1e4]))
-    fit = body_track.BodyFit(solution, np.arange(3), 3)
-    assert body_track._without_disagreeing(fit, few, 4.0) is fit
+@pytest.mark.parametrize(('readings', 'factor'), [(3, 25.0), (4, 1.0)])
+def test_a_pose_that_no_reading_judges_is_as_uncertain_as_a_misfit(readings, factor):
+    frame = SimpleNamespace(context=SimpleNamespace(readings=readings))
+    assert body_track._unjudged(SimpleNamespace(used=[0, 1]), frame) == factor

@@ -16,7 +16,7 @@ from anser_ros.tracking.coil_track import CoilResult, CoilTracks
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve import bounded_inverse
-from anser_ros.tracking.solve_verdict import RARE, Freedom, SolveFrame
+from anser_ros.tracking.solve_verdict import RARE, SYSTEMATIC, Freedom, SolveFrame
 
 DISAGREES = 4.0
 """A coil is left out when its share of the misfit is so many times the mean of the others'."""
@@ -196,8 +196,7 @@ def _without_disagreeing(fit: BodyFit, frame: BodyFrame, gate: float) -> BodyFit
         worst = int(np.argmax(misfit))
         others = np.delete(misfit, worst)
         rest = np.delete(fit.used, worst)
-        few = len(rest) * frame.context.readings <= UNKNOWNS  # they fit whatever they are
-        if few or len(rest) < 2 or not frame.coils.subset(rest).observable:
+        if len(rest) < 2 or not frame.coils.subset(rest).observable:
             break
         if misfit[worst] < DISAGREES * others.mean():
             break
@@ -300,7 +299,7 @@ def _judge(
     solution = fit.solution
     covariance = bounded_inverse(solution.information)
     gain, carried = solution.gain(covariance)
-    by_gain = np.outer(gain * carried, gain * carried)
+    by_gain, factor = np.outer(gain * carried, gain * carried), _unjudged(fit, frame)
     position, rotation = solution.position, solution.rotation
     others = (
         (rival.solution.chi2, 'another pose')
@@ -310,7 +309,7 @@ def _judge(
     estimate = frame.estimate(
         track.noise, solution, Freedom(fit.freedom, UNKNOWNS, RARE),
         (position, rotation[:, 2].copy(), rotation),
-        lambda scale: covariance + by_gain / scale, others,
+        lambda scale: factor * covariance + by_gain / scale, others,
         position + rotation @ frame.coils.subset(fit.used).offsets.mean(axis=0),
     )  # fmt: skip
     left_out = len(frame.single) - len(fit.used)
@@ -318,6 +317,11 @@ def _judge(
         reason = f'{left_out} of {len(frame.single)} coils left out'
         estimate = replace(estimate, reason=reason)
     return estimate, gain
+
+
+def _unjudged(fit: BodyFit, frame: BodyFrame) -> float:
+    """Return the factor on variances: that of a misfit where no reading is left to show one."""
+    return 1.0 if len(fit.used) * frame.context.readings > UNKNOWNS else SYSTEMATIC
 
 
 def _apart(one: rigid.BodySolution, other: rigid.BodySolution) -> bool:
