@@ -46,30 +46,31 @@ from anser_ros.field.nominal import GAIN, LOWEST_M, SHIFT_M, TILT_RAD
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import along_each_axis
 
-REST = 1e-4
+REST = 5e-5
 """Standard deviation of a moment of the layer for what the drawing lacks, relative to a coil's:
-leads a millimetre apart that are some centimetres long enclose that share of the turns' area."""
+leads half a millimetre apart, some centimetres long, enclose that share of the turns' area."""
 REST_LAYER = Layout('layer', 8, 1.1, 0.0)
 """That layer: dipoles every 3 to 4 cm, closer than the distance to any sensor."""
 REST_MODES = 24
 """Its combinations that are fitted; at `LOWEST_M` others make a thousandth."""
 HEIGHTS_M = LOWEST_M * np.array([1.0, 1.5, 2.5, 4.0])
 """Heights over the board at which its field is looked at."""
-COIL = {'shift': SHIFT_M, 'turn': TILT_RAD, 'strength': GAIN, 'size': 1e-3, 'rest': REST}
+COIL = {'shift': SHIFT_M, 'turn': TILT_RAD, 'strength': GAIN, 'shape': 1e-3}
 """Standard deviations of a coil's errors: m, rad, and relative."""
 SENSORS = {'gains': 0.02, 'axes': 0.02, 'places': 5e-4}
 """The same of the sensors': relative, rad, m, those of coils wound and glued by hand."""
-LEVEL = np.array([0.02, 0.02, 0.01])
+LEVEL = np.array([0.02] * 2 + [0.01] * 3)
 """The same of what all coils share, relative: strength (real, imaginary), as by a sensor's turns,
-and size of the windings, where a drawing counts half a track more or less."""
+and shape of the windings, where a drawing counts half a track more or less on some sides."""
 PLATE = np.array([1.5e-3] * 3 + [0.01] * 3 + [3e-4])
 """The same of a plate's place (m), turn (rad) and scale: laid by eye, drilled well."""
 PLACE = np.array([1.5e-4] * 3 + [5e-3] * 3)
 """The same of a place on a plate (m, rad): a probe has some play in it."""
 FREE = np.array([0.1] * 3 + [1.0] * 3)
 """The same of a pose that nothing states, m and rad."""
-SCALE = 7e-4
-"""The same of the scale that all coils' places share: a board is made in one piece."""
+SCALE = 1.2e-3
+"""The same of the scale that all coils' places share: what coils that are placed to 0.35 mm, each
+by itself, make of it."""
 STATED = 12.0
 """Values of a population that its stated width counts as when it is learnt."""
 WIDEST = 3.0
@@ -89,18 +90,21 @@ MOST_READINGS = 1000
 MOST_MODES = 64
 """Modes of the model's covariance: what more would add is below a hundredth of the noise."""
 STEP = 1e-5
-"""Step of the differences by a coil's place (m), turn (rad) and size."""
+"""Step of the differences by a coil's place (m), turn (rad) and shape."""
 
 KINDS = {
     'shift': slice(0, 3),
     'turn': slice(3, 6),
     'strength': slice(6, 8),
-    'size': slice(8, 9),
-    'rest': slice(9, None),
+    'shape': slice(8, 11),
+    'rest': slice(11, None),
 }
 """Where the parameters of these kinds stand among a coil's own."""
-OWN = 9 + REST_MODES
+OWN = 11 + REST_MODES
 """Parameters of a coil."""
+SHAPES = np.array([[[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
+"""Changes of a flat coil's shape by one unit, in its own frame: larger, longer in x than in y, and
+longer along one diagonal than the other. What artwork lacks of its turns is one of them."""
 
 
 def _turned(vectors: Array) -> Array:
@@ -119,13 +123,18 @@ class Drawing:
     """A board's drawing as N dipoles, coil by coil, and L more for what it lacks.
 
     The errors of its K coils are a table (K, `OWN`): shift (m), turn (rad) about the centre,
-    complex strength less one, size less one, and amplitudes of the combinations of the L dipoles.
+    complex strength less one, `SHAPES`, and amplitudes of the combinations of the L dipoles.
     """
 
     def __init__(self, generator: Generator) -> None:
         assert generator.nominal is not None
         self.nominal, self.centres = generator.nominal, generator.centres
         self.owner = np.argmax(np.abs(self.nominal.moments), axis=1)
+        self.arms = self.nominal.positions - self.centres[self.owner]
+        frames = _turned(np.outer(np.deg2rad(generator.turns_deg), [0.0, 0.0, 1.0]))[:, :2, :2]
+        ways = np.einsum('kij,sjl,kml->ksim', frames, SHAPES, frames)[self.owner]
+        self.shapes = np.zeros((len(self.arms), 3, len(SHAPES)))
+        self.shapes[:, :2] = np.einsum('nsij,nj->nis', ways, self.arms[:, :2])
         self.layer = place(REST_LAYER, generator)
         square = grid(9, 1.6 * generator.half_extent)
         flat = generator.middle + np.column_stack([square, np.zeros(len(square))])
@@ -138,10 +147,10 @@ class Drawing:
     def dipoles(self, errors: Array) -> Dipoles:
         """Return the dipoles (N + L) of a board with such errors."""
         turns, own = _turned(errors[:, 3:6])[self.owner], self.centres[self.owner]
-        arms = np.einsum('nij,nj->ni', turns, self.nominal.positions - own)
-        arms *= 1.0 + errors[self.owner, 8, None]
+        arms = self.arms + np.einsum('nis,ns->ni', self.shapes, errors[self.owner, KINDS['shape']])
+        arms = np.einsum('nij,nj->ni', turns, arms)
         along = np.einsum('nij,nj->ni', turns, self.nominal.directions)
-        moments = np.concatenate([self.nominal.moments, self.rest @ errors[:, 9:].T])
+        moments = np.concatenate([self.nominal.moments, self.rest @ errors[:, KINDS['rest']].T])
         return Dipoles(
             np.concatenate([own + errors[self.owner, :3] + arms, self.layer.positions]),
             np.concatenate([along, self.layer.directions]),
@@ -155,7 +164,7 @@ class Drawing:
         rest = np.concatenate([np.zeros((len(self.owner), REST_MODES)), self.rest])
         for k in range(len(errors)):
             pairs = []
-            for j in (*range(6), 8):
+            for j in (*range(6), *range(8, 11)):
                 step = np.zeros_like(errors)
                 step[k, j] = STEP
                 ahead, behind = (
@@ -240,7 +249,7 @@ class DrawnFitter:
         self.parts = list(_parts(measurements, typed))
         self.middle = np.mean(np.concatenate([p.stated.position for p in self.parts]), axis=0)
         self.count = len(generator.centres)
-        ends = np.cumsum([OWN * self.count, 3, 7, len(self.sensors)]).tolist()
+        ends = np.cumsum([OWN * self.count, LEVEL.size, 7, len(self.sensors)]).tolist()
         self.own, self.level, self.plate, self.sensed = (
             slice(*pair) for pair in zip([0, *ends[:3]], ends, strict=True)
         )
@@ -250,14 +259,16 @@ class DrawnFitter:
         arms = generator.centres - generator.middle
         self.scale = np.zeros(ends[3])
         self.scale[table[:, :3].ravel()] = arms.ravel() / (arms**2).sum()
-        self.groups = [(table[:, at].ravel(), COIL[kind]) for kind, at in KINDS.items()]
-        start = self.sensed.start
+        self.rest, start = table[:, KINDS['rest']].ravel(), self.sensed.start
+        self.width[self.rest] = REST
+        self.groups = [(table[:, KINDS[kind]].ravel(), width) for kind, width in COIL.items()]
         self.groups += [(start + rows, SENSORS[kind]) for kind, rows in self.sensors.groups()]
         for rows, width in self.groups:
             self.width[rows] = width
 
     def fit(self, progress: Progress | None = None) -> DrawnFit:
         """Take steps until they are small."""
+        self.groups.append((self.rest, REST))
         steps = self._settle(STEPS, progress)
         return self._result([self._sums(part) for part in self.parts], steps)
 
@@ -278,8 +289,7 @@ class DrawnFitter:
 
         What the drawing lacks is left to moments of their own that they get.
         """
-        rest, _ = self.groups.pop(list(KINDS).index('rest'))
-        self.width[rest] = 1e-12
+        self.width[self.rest] = 1e-12
         self._settle(PLACING_STEPS)
         shift, turn, scale = np.split(self.values[self.plate], [3, 6])
         back, own = _turned(turn), slice(len(self.drawing.owner))
@@ -288,13 +298,19 @@ class DrawnFitter:
             self.middle + places, self.dipoles.directions[own] @ back, self.dipoles.moments[own]
         )
 
+    def planned(self) -> FieldModel:
+        """Return the drawing with what readings at these poses leave open, by stated widths."""
+        self._place(self.values)
+        likelihood = self._likelihood([self._sums(part) for part in self.parts])
+        return self._model(solve(likelihood, self.width).covariance)[0]
+
     def errors(self, values: Array) -> Array:
         """Return the coils' errors (K, OWN) with what they share."""
         errors = values[self.own].reshape(self.count, OWN).copy()
-        real, imaginary, size = values[self.level]
+        (real, imaginary), shape = np.split(values[self.level], [2])
         strength = (1.0 + errors[:, 6] + 1j * errors[:, 7]) * (1.0 + real + 1j * imaginary)
         errors[:, 6], errors[:, 7] = strength.real - 1.0, strength.imag
-        errors[:, 8] += size
+        errors[:, KINDS['shape']] += shape
         return errors
 
     def _place(self, values: Array) -> None:
@@ -326,14 +342,14 @@ class DrawnFitter:
         terms, made = self._terms(now)
         jitter = self.jitter if part.is_typed else FREE
         white = PoseWhitener(terms.slope, part.weights, self.noise_t, jitter**-2.0)
-        by_size = self._by_size(now, made[0])
-        shared = self._shared(part, terms, made, by_size)
+        by_shape = self._by_shape(now, made[0])
+        shared = self._shared(part, terms, made, by_shape)
         root = (np.sqrt(part.weights) / self.noise_t)[:, :, None]
         frames, sensors = part.weights.shape
         slope = white.slope.reshape(frames, sensors, -1, 6)
         normal, gradient = np.zeros((size, size)), np.zeros(size)
         mixed = np.zeros((frames, 6, size))
-        for k, own in enumerate(self._of_coils(now, made, by_size)):
+        for k, own in enumerate(self._of_coils(now, made, by_shape)):
             pair = slice(2 * k, 2 * k + 2)
             rows = np.concatenate([own, shared[:, :, pair]], axis=3) * root[..., None]
             rows = rows.reshape(frames, 2 * sensors, -1)
@@ -351,20 +367,22 @@ class DrawnFitter:
         variance = np.diagonal(white.inverse, axis1=1, axis2=2)
         return _Sums((normal + normal.T) / 2.0, gradient, answer, step, variance, white.freedom)
 
-    def _by_size(self, now: Measurements, flux: ComplexArray) -> ComplexArray:
-        """Derivatives (F, S, K) of fluxes by the size of the windings."""
+    def _by_shape(self, now: Measurements, flux: ComplexArray) -> ComplexArray:
+        """Derivatives (F, S, K, 3) of fluxes by the shape of the windings."""
         points, axes = (of_all.reshape(-1, 3) for of_all in now.placed())
-        larger = self.drawing.dipoles(self.board + STEP * (np.arange(OWN) == 8))
-        lengths = np.tile(now.sensors.length, len(now.time))
-        made = larger.flux(points, axes, lengths).reshape(flux.shape)
-        return np.asarray((made - flux) / STEP)
+        lengths, out = np.tile(now.sensors.length, len(now.time)), []
+        for unit in np.eye(OWN)[KINDS['shape']]:
+            made = self.drawing.dipoles(self.board + STEP * unit).flux(points, axes, lengths)
+            out.append((made.reshape(flux.shape) - flux) / STEP)
+        return np.stack(out, axis=-1)
 
     def _shared(
-        self, part: _Part, terms: PoseTerms, made: tuple[ComplexArray, ...], by_size: ComplexArray
+        self, part: _Part, terms: PoseTerms, made: tuple[ComplexArray, ...], by_shape: ComplexArray
     ) -> Array:
         """Derivatives (F, S, 2K, .) by what all coils share: level, plate and sensors."""
         now, flux = part.now, made[0]
-        level = np.stack([as_real(one) for one in (flux, 1j * flux, by_size)], axis=-1)
+        whole = (flux, 1j * flux, *np.moveaxis(by_shape, -1, 0))
+        level = np.stack([as_real(one) for one in whole], axis=-1)
         ways = np.zeros((len(now.time), 6, 7))
         if part.is_typed:
             ways[:, :3, :6] = _carried(now.position, self.middle)
@@ -378,7 +396,7 @@ class DrawnFitter:
         return np.concatenate([level, plate, by_sensors], axis=3)
 
     def _of_coils(
-        self, now: Measurements, made: tuple[ComplexArray, ...], by_size: ComplexArray
+        self, now: Measurements, made: tuple[ComplexArray, ...], by_shape: ComplexArray
     ) -> Iterator[Array]:
         """Yield the derivatives (F, S, 2, OWN) of each coil's fluxes by its own errors."""
         flux, by_place, by_axis = made
@@ -391,8 +409,8 @@ class DrawnFitter:
             turn = np.cross(arms, by_place[..., k]) + np.cross(axes, by_axis[..., k])
             strength = 1.0 + errors[6] + 1j * errors[7]
             own = flux[..., k, None] / strength
-            size = by_size[..., k, None]
-            each = [-by_place[..., k], -turn, own, 1j * own, size, strength * rest]
+            shape = by_shape[..., k, :]
+            each = [-by_place[..., k], -turn, own, 1j * own, shape, strength * rest]
             whole = np.concatenate(each, axis=-1)
             yield np.stack([whole.real, whole.imag], axis=2)
 
@@ -455,16 +473,12 @@ class DrawnFitter:
             held_out.append(self._terms(part.now)[0])
         # A gain that all sensors share is the board's.
         gains, common = self.sensors.by_rule(found.values[self.sensed])
-        level = (1.0 + found.values[self.level] @ [1.0, 1j, 0.0]) * common
+        level = (1.0 + found.values[self.level][:2] @ [1.0, 1j]) * common
         self.values = found.values.copy()
         self.values[self.sensed] = gains
         self.values[self.level][:2] = level.real - 1.0, level.imag
         self._place(self.values)
-        # So their product is known, though neither is by itself.
-        known, first = np.eye(len(found.values)), self.sensed.start + self.sensors.rows('gains')
-        for phase, rows in enumerate(first.reshape(-1, 2).T):
-            known[self.level.start + phase, rows] = 1.0 / max(len(rows), 1)
-        model, frame_sigma = self._model(known @ found.covariance @ known.T)
+        model, frame_sigma = self._model(found.covariance)
         sensed = replace(
             found, values=gains, width=self.width[self.sensed],
             covariance=found.covariance[self.sensed, self.sensed],
@@ -486,12 +500,17 @@ class DrawnFitter:
 
         The frame's motion is that which makes the field over the board most like a given one.
         """
+        # The product of strength and gains is known, though neither is by itself.
+        known, first = np.eye(len(covariance)), self.sensed.start + self.sensors.rows('gains')
+        for phase, rows in enumerate(first.reshape(-1, 2).T):
+            known[self.level.start + phase, rows] = 1.0 / max(len(rows), 1)
+        covariance = known @ covariance @ known.T
         drawing, here, size = self.drawing, self.dipoles, OWN * self.count
         columns = drawing.columns(self.board)
         basis = flux_basis(*drawing.lattice, None, here.positions, here.directions)
         lift = np.zeros((size, len(covariance)))
         lift[:, :size] = np.eye(size)
-        for j in range(3):
+        for j in range(LEVEL.size):
             lift[6 + j : size : OWN, self.level.start + j] = 1.0
         motion = np.zeros((self.count, OWN, 6))
         motion[:, :3] = _carried(drawing.centres + self.board[:, :3], self.middle)

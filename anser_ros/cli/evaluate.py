@@ -15,7 +15,9 @@ from anser_ros.cli import output, sessions
 from anser_ros.cli import page as html
 from anser_ros.cli.commands import SESSION_KINDS
 from anser_ros.errors import ParameterError
+from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
+from anser_ros.pose_states import RESIDUAL
 from anser_ros.sessions.follower import parse_references, with_references
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import model_for
@@ -304,6 +306,7 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         *sessions.snapshot_notes(args.model, model),
         *output.loss_notes(session, baseline),
         *(_few_notes(session) if args.refit else ()),
+        *_other_coils(model, evaluation),
     )  # fmt: skip
     return output.Result(document, notes, tuple(shown), tuple(written))
 
@@ -317,6 +320,20 @@ def _few_notes(session: Session) -> tuple[str, ...]:
     return (
         f'a refit with {count} reference sensors gives no pose, because min_references is '
         f'{need}; evaluate without --refit, or --set min_references={max(count, 1)}',
+    )
+
+
+def _other_coils(model: FieldModel, evaluation: Evaluation) -> tuple[str, ...]:
+    """State what to do where most coils misfit a model that knows some of them."""
+    known = sorted({c for effect in model.effects for c in effect.parameters.get('channels', ())})
+    states = [pose.state for coil in evaluation.sensors.values() for pose in coil.estimates]
+    if not known or 2 * states.count(RESIDUAL) <= len(states):
+        return ()
+    return (
+        f'most poses are withheld, state {RESIDUAL}: the model knows the coils of its calibration '
+        f'(channels {", ".join(map(str, known))}); another one is off in gain and axis, by 2 % '
+        'and 1 deg as wound by hand, and so is an emitter that warmed up: calibrate with what is '
+        'tracked, when the board is warm',
     )
 
 

@@ -1,8 +1,9 @@
 """Says which accuracy which effort of calibration buys, for the reader's own board and tool.
 
-Every effort is simulated on a board as boards are made, by the populations of the drawn fit, which
-then fits the readings. What it leaves open of the field (its modes) moves the poses of single
-coils: that is the bound, whatever the errors of this one board are.
+The drawn fit says what an effort leaves open of a board that is made as boards are, before
+anything is read. What is open of the field (its modes) moves the poses of single coils: that is
+the bound, whatever the errors of this one board are. With an optical tracker the frame is that
+tracker's.
 """
 
 import argparse
@@ -12,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import Array
 from anser_ros.calibration import drawn_fit as drawn
@@ -24,7 +24,7 @@ from anser_ros.errors import SetupError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import Dipoles, FieldModel
 from anser_ros.field.nominal import nominal_model
-from anser_ros.physics.rotations import tangents, tilted
+from anser_ros.physics.rotations import tangents
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import Region, region_of
 from anser_ros.sessions.calibration import generator_of
@@ -39,7 +39,7 @@ SCHEMA = 'anser_plan/1'
 DOCUMENT, FIGURE = 'plan.json', 'plan.png'
 PLANES = (0.55, 1.0)
 """Heights of a plate, in halves of the board: 84 and 150 mm over an Anser board."""
-WORKING, REACH = (0.5, 1.7), 0.85
+WORKING, REACH = (0.5, 1.5), 0.85
 """Heights between which a tool is moved and poses are judged, and how far to the side of the
 middle, in halves of the board."""
 BANDS = np.linspace(0.4, 2.2, 10)
@@ -90,7 +90,7 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     models = {'the drawing alone': nominal}
     for count, effort in enumerate(efforts):
         tell(effort.words, count / len(efforts))
-        models[effort.words] = calibrated(effort, generator, noise_t)
+        models[effort.words] = planned(effort, generator, noise_t)
     figures = {words: pose_sigmas(model, region, noise_t) for words, model in models.items()}
     rows = [{'effort': words, **found} for words, found in figures.items()]
     document = {'schema': SCHEMA, 'body': body, 'efforts': rows}
@@ -128,36 +128,27 @@ def efforts_of(tool: SensorTable, region: Region, emitters: int) -> Iterator[Eff
     yield Effort('60 s before an optical tracker', tool, hand, minute, CAMERA)
 
 
-def calibrated(effort: Effort, generator: Generator, noise_t: float) -> FieldModel:
-    """Return the model of an effort on a board that is made as boards are."""
-    rng, drawing, count = np.random.default_rng(SEED), drawn.Drawing(generator), len(effort.times)
-    stated, turns = map(np.array, zip(*map(effort.path, effort.times.tolist()), strict=True))
-    stated += generator.middle
-    errors = np.zeros((len(generator.centres), drawn.OWN))
-    for kind, own in drawn.KINDS.items():
-        errors[:, own] = drawn.COIL[kind] * rng.normal(size=errors[:, own].shape)
-    board, sensors = drawing.dipoles(errors), effort.sensors
-    if len(sensors) > 1:
-        shift = drawn.SENSORS['places'] * rng.normal(size=sensors.position.shape)
-        sensors = replace(sensors, position=sensors.position + shift)
-    tilt = drawn.SENSORS['axes'] * rng.normal(size=(len(sensors), 2))
-    sensors = replace(sensors, axis=tilted(sensors.axis, tilt))
-    off = (0.0 if effort.errors is None else effort.errors) * rng.normal(size=(count, 6))
-    turned = Rotation.from_rotvec(off[:, 3:]).as_matrix() @ turns
-    points, axes = sensors.placed(stated + off[:, :3], turned)
-    lengths = np.tile(sensors.length, count)
-    flux = board.flux(points.reshape(-1, 3), axes.reshape(-1, 3), lengths)
-    flux = flux.reshape(count, len(sensors), -1)
-    flux = flux + noise_t * (rng.normal(size=flux.shape) + 1j * rng.normal(size=flux.shape))
-    there = np.ones(flux.shape[:2], dtype=bool)
+def planned(effort: Effort, generator: Generator, noise_t: float) -> FieldModel:
+    """Return the drawing with what an effort leaves open of a board that is made as boards are."""
+    position, turn = map(np.array, zip(*map(effort.path, effort.times.tolist()), strict=True))
+    position += generator.middle
+    points, axes = (each.reshape(-1, 3) for each in effort.sensors.placed(position, turn))
+    count, sensors = len(effort.times), len(effort.sensors)
+    assert generator.nominal is not None
+    flux = generator.nominal.flux(points, axes, np.tile(effort.sensors.length, count))
+    there = np.ones((count, sensors), dtype=bool)
     read = Measurements(
-        effort.sensors.body[0], effort.sensors, effort.times, flux, there,
-        np.zeros(there.shape, dtype=np.int64), stated, turns, there[:, 0],
+        effort.sensors.body[0], effort.sensors, effort.times, flux.reshape(count, sensors, -1),
+        there, np.zeros(there.shape, dtype=np.int64), position, turn, there[:, 0],
     )  # fmt: skip
-    # What all gains share is the board's strength, and in what they differ is learnt at once.
-    is_typed, kinds = [effort.errors is not None], ('axes', 'places')
-    fitter = drawn.DrawnFitter(drawn.evenly([read]), is_typed, generator, kinds, noise_t)
-    return fitter.fit().model
+    is_typed = [effort.errors is not None]
+    fitter = drawn.DrawnFitter(
+        drawn.evenly([read]), is_typed, generator, tuple(drawn.SENSORS), noise_t
+    )
+    if effort.errors is not None:
+        fitter.jitter = effort.errors
+    model = fitter.planned()
+    return replace(model, shift_sigma_m=0.0) if effort.errors is CAMERA else model
 
 
 def pose_sigmas(model: FieldModel, region: Region, noise_t: float) -> dict[str, Any]:

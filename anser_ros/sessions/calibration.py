@@ -23,7 +23,7 @@ from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.readings import check_single_coils, with_pose
 from anser_ros.calibration.result import Calibration, Scan, drift_records
-from anser_ros.calibration.sensor_parameters import EXTRA_KINDS
+from anser_ros.calibration.sensor_parameters import EXTRA_KINDS, KINDS
 from anser_ros.diagnosis.departure import KNOWN, Departure, departure
 from anser_ros.diagnosis.problem import Problem, Spread, build_problem
 from anser_ros.diagnosis.wiring import rightly_wired, scan_faults
@@ -391,7 +391,14 @@ def calibrate_sessions(
     for engine in () if chosen.is_joint else all_engines():
         if asked := [kind for kind in options.estimate if kind in engine.kinds]:
             raise FitError(f'{", ".join(asked)}: can be determined only from {engine.needs}')
-    calibration = chosen.fit(sessions, options, progress)
+    try:
+        calibration = chosen.fit(sessions, options, progress)
+    except FitError as error:
+        usual = replace(options, layout=None, estimate=KINDS)
+        if chosen is DRAWN or not DRAWN.accepts(sessions, usual):
+            raise
+        words = '; the drawn board, which such readings suffice for, is fitted without --dipoles'
+        raise FitError(f'{error}{words} and --estimate none') from error
     model = calibration.model
     for session in sessions:
         model = made_for(model, session.setup)

@@ -6,7 +6,8 @@ typed first: places of another pitch, a place that was missed, or a probe upside
 by name.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from anser_ros.arrays import Array
 from anser_ros.calibration.calibrate import Options
-from anser_ros.calibration.drawn_fit import PLACE, PLATE, DrawnFit, DrawnFitter, evenly
+from anser_ros.calibration.drawn_fit import PLACE, PLATE, SCALE, DrawnFit, DrawnFitter, evenly
 from anser_ros.calibration.held_out import HeldOutTally
 from anser_ros.calibration.layout_fit import RICH
 from anser_ros.calibration.layouts import Generator, Layout
@@ -60,6 +61,11 @@ MOST_ASTRAY = 0.1
 OTHER_PITCH = 0.05
 """Relative difference of a pitch from the typed one that is named: far more than a drawn board's
 own errors make of it."""
+OTHER_GAIN = 0.1
+"""The same of a probe's gain: five times what coils differ that are wound by hand."""
+MOST_GAPS = 3
+"""Places of a lattice without a reading, for each with one, up to which it is one: any places lie
+on the lattice of all their coordinates."""
 IN_A_LINE = 0.01
 """Ratio of a plate's square widths below which its places lie in a line, which tells no mirror."""
 CLEAR = 2.0
@@ -101,7 +107,9 @@ def fit_to_drawing(
         starts = _drawn_poses(session, generator.nominal)
         for tool, start in zip(session.tools, starts, strict=True):
             typed.append(bool(tool.has_pose.any()))
-            if typed[-1] and (contradiction := check_typed(with_pose(tool), start)):
+            if typed[-1] and (
+                contradiction := check_typed(with_pose(tool), start, generator.nominal)
+            ):
                 if is_thick([with_pose(tool)]):
                     return None  # metal moves them as well, and a free field says so
                 raise FitError(contradiction)
@@ -178,12 +186,13 @@ def _drawn_poses(session: Session, nominal: FieldModel | None) -> list[Measureme
     return out
 
 
-def check_typed(typed: Measurements, drawn: Measurements) -> str:
+def check_typed(typed: Measurements, drawn: Measurements, nominal: FieldModel | None) -> str:
     """Return in words how far typed places are from where the drawn board puts them, if they are.
 
     Raises `FitError` with the size where that has a reason with a name.
 
-    ``drawn`` are all frames of the same body at the poses that the drawn board gives them.
+    ``drawn`` are all frames of the same body at the poses that the drawn board gives them, which
+    is the ``nominal`` one.
     """
     found = drawn.frames(np.isin(drawn.time, typed.time))
     known = found.has_pose
@@ -196,6 +205,16 @@ def check_typed(typed: Measurements, drawn: Measurements) -> str:
             f'{typed.body}: the coil points the other way than typed, by '
             f'{DEGREES * np.arccos(np.clip(np.median(alike), -1.0, 1.0)):.0f} deg: is its axis '
             'reversed, or the probe upside down?'
+        )
+    assert nominal is not None
+    length = np.repeat(typed.sensors.length[:1], len(places))
+    made, read = nominal.flux(places, typed.placed()[1][:, 0], length), typed.flux[:, 0]
+    gain = float(np.vdot(made, read).real / np.vdot(made, made).real)
+    size = np.linalg.norm(read - gain * made) / np.linalg.norm(made)
+    if abs(gain - 1.0) > max(OTHER_GAIN, 4.0 * size):
+        raise FitError(
+            f'{typed.body}: the readings are {gain:.2f} times what the drawn board gives at the '
+            "typed places: is the probe's gain or the emitters' current stated wrongly?"
         )
     off = np.linalg.norm(there - places, axis=1)
     if np.mean(off[known] > NEAR_M) <= MOST_ASTRAY:
@@ -218,7 +237,15 @@ def check_typed(typed: Measurements, drawn: Measurements) -> str:
     turn[:2, :2] = one @ other
     scale = float((arms @ turn.T * ways).sum() / (arms**2).sum())
     rest = np.linalg.norm(ways - scale * arms @ turn.T, axis=1)
-    away = f'{1e3 * np.median(off[known]):.0f} mm (median) from where it was typed'
+    away = (
+        f'{1e3 * np.median(off[known]):.0f} mm (median), up to {1e3 * off[known].max():.0f} mm, '
+        'from where it was typed'
+    )
+    if middle[2] < 0.0 < centre[2]:
+        raise FitError(
+            f'{typed.body}: the plate is typed {-1e3 * middle[2]:.0f} mm below the board and lies '
+            f'{1e3 * centre[2]:.0f} mm above it: is z reversed, or the plate upside down?'
+        )
     if np.mean(rest > NEAR_M) <= MOST_ASTRAY and sizes[1] > IN_A_LINE * sizes[0]:
         if abs(scale - 1.0) > OTHER_PITCH:
             raise FitError(
@@ -229,9 +256,17 @@ def check_typed(typed: Measurements, drawn: Measurements) -> str:
             f'{typed.body}: {_plate_words(turn, centre - middle)}: the drawn board puts the coil '
             f'{away}, and {1e3 * np.median(rest):.0f} mm with that undone'
         )
+    near, order = cKDTree(places).query(there[known])
+    if np.mean(near > NEAR_M) <= MOST_ASTRAY:
+        rows = np.flatnonzero(known)
+        first = int(np.flatnonzero(order != rows)[0])
+        return (
+            f'{typed.body}: the places are typed in another order: reading {rows[first] + 1} was '
+            f'taken at place {order[first] + 1}; the drawn board puts the coil {away}'
+        )
     return (
-        f'{typed.body}: the drawn board puts the coil {away}, and no turn, mirror image or other '
-        'pitch of the plate explains it: are places in another order, or elsewhere?'
+        f'{typed.body}: the drawn board puts the coil {away}, and no turn, mirror image, pitch or '
+        'order of the places explains it: are they elsewhere?'
     )
 
 
@@ -285,7 +320,7 @@ def _calibration(
         residuals=residuals(now, model),
         scan=Scan(now, accuracy, corrected, (), sensors if all(typed) else None),
         nominal_rmse_t=residuals(stated, nominal).rmse_t if all(typed) and nominal else None,
-        undetermined=(frame,), contradictions=_doubts(fit),
+        undetermined=(frame, *_gaps(stated)), contradictions=_doubts(fit, generator),
         emitters=emitter_rows(fit, generator), more={
             'frame': {
                 'shift_sigma_m': fit.frame_sigma[:3].tolist(),
@@ -299,13 +334,29 @@ def _calibration(
     )  # fmt: skip
 
 
-def _doubts(fit: DrawnFit) -> tuple[str, ...]:
+def _gaps(typed: Sequence[Measurements]) -> Iterator[str]:
+    """Yield a line where typed places are a lattice of which some have no reading."""
+    for m in typed:
+        places = np.unique(np.round(m.position[m.usable.any(axis=1)], 3), axis=0)
+        whole = math.prod(len(np.unique(line)) for line in places.T)
+        if len(places) < whole <= (1 + MOST_GAPS) * len(places):
+            yield (
+                f'{m.body}: {whole - len(places)} of the {whole} places of the lattice have no '
+                'reading, and the field is less known there'
+            )
+
+
+def _doubts(fit: DrawnFit, generator: Generator) -> tuple[str, ...]:
     """A line for a plate, and for each of its places, that is off by far more than such are."""
-    lines, scale = [], float(fit.plate[6])
-    if abs(scale) > FAR * PLATE[6]:
-        size = f'{100 * abs(scale):.2f} % {"larger" if scale > 0 else "smaller"}'
-        true = f'and plates are true to {100 * PLATE[6]:.2f} %'
-        lines.append(f'the plate comes out {size} than typed, {true}: is the pitch right?')
+    lines, arms = [], generator.centres - generator.middle
+    scale = float(fit.plate[6] - (arms * fit.errors[:, :3]).sum() / (arms**2).sum())
+    usual = float(np.hypot(PLATE[6], SCALE))
+    if abs(scale) > FAR * usual:
+        size = f'{100 * abs(scale):.1f} % {"larger" if scale > 0 else "smaller"}'
+        true = f'and plate and board are true to {100 * usual:.1f} %'
+        lines.append(
+            f'the plate comes out {size} than typed beside the board, {true}: is the pitch right?'
+        )
     typed = [part for part in fit.parts if part.is_typed]
     if not typed:
         return tuple(lines)
