@@ -32,6 +32,8 @@ an X-ray head touches the board, and simulated slides of 0.05 mm are at 100 to 2
 COMMON_GAIN, LEAST_GAIN = 0.05, 1e-4
 """Standard deviation of a gain that all references, or all emitters, have in common, as when one
 amplifier or supply warms up; and the least that counts: it moves no pose by more than 10 um."""
+IMPROBABLE = 40.0
+"""Log odds against a strength, beside the best one, from which on it is left out: 1 in 10^17."""
 MOST_KEPT = 64
 """Hypotheses at a noise level whose matrices are kept."""
 
@@ -60,7 +62,8 @@ class FrameMotion:
         columns[0], columns[-1, 0] = np.concatenate(whole), COMMON_GAIN * drawn.flux
         for k in range(len(emitters)):
             columns[1 + k, :3, :, k] = -whole[0][:, :, k]
-        self._columns = columns.reshape(*columns.shape[:2], -1).swapaxes(1, 2) / noise_t
+        self._things = len(columns)
+        self._columns = columns.reshape(6 * len(columns), -1).T / noise_t  # a row for a reading
 
     def forget(self) -> None:
         """Believe that nothing has moved, and look with the next frame."""
@@ -71,31 +74,36 @@ class FrameMotion:
         if self._last_ns <= stamp_ns < self._next_ns:
             return
         self._last_ns, self._next_ns = stamp_ns, stamp_ns + LOOK_S / NANO
-        odds, best = np.full(len(self._columns), -np.inf), (-np.inf, 0, np.zeros(6), np.zeros(6))
+        odds, best = np.full(self._things, -np.inf), (-np.inf, 0, np.zeros(6), np.eye(6))
         for hypothesis in {0, seen.best}:
-            columns, inverse, half_log_det = self._known_of(bank, hypothesis, seen.noise)
-            precision, curve = bank.precision(seen.noise)[0], seen.curve[hypothesis, 0]
-            weighted = precision[hypothesis] * seen.projected[hypothesis, :, 0]
-            b = weighted @ columns  # (2 + K, A, 6)
-            moved = (inverse @ b[..., None])[..., 0]
-            gained = curve + 0.5 * (b * moved).sum(axis=2) - half_log_det
-            evidence = np.logaddexp.reduce(gained, axis=1) - log_sum(curve)
+            columns, factor, half_log_det = self._known_of(bank, hypothesis, seen.noise)
+            precision, log_det = bank.precision(seen.noise)
+            curve = seen.curve[hypothesis, 0, : len(factor)]
+            # A strength has no more evidence than if readings were explained wholly.
+            most = 2.0 * (IMPROBABLE - float(curve.max()))
+            a = int(np.count_nonzero(log_det[hypothesis, : len(factor)] < most))
+            weighted = precision[hypothesis, :a] * seen.projected[hypothesis, :, 0]
+            b = (weighted @ columns).reshape(a, *factor.shape[1:3])  # (A, 2 + K, 6)
+            white = np.einsum('akij,akj->aki', factor[:a], b)
+            gained = curve[:a, None] + 0.5 * (white**2).sum(axis=2) - half_log_det[:a]
+            evidence = np.logaddexp.reduce(gained, axis=0) - log_sum(curve)
             evidence += float(seen.log_evidence[hypothesis])
             if hypothesis > 0:
                 evidence[-1] = -np.inf
             odds = np.logaddexp(odds, evidence)
             what = int(evidence.argmax())
             if evidence[what] > best[0]:
-                top = int(gained[what].argmax())
-                sigma = np.sqrt(np.diag(inverse[what, top]))
-                best = float(evidence[what]), what, moved[what, top], sigma
+                top = int(gained[:, what].argmax())
+                best = float(evidence[what]), what, white[top, what], factor[top, what]
+        _, what, white, factor = best
+        motion, sigma = white @ factor, np.sqrt((factor**2).sum(axis=0))
         # Far away a motion is not linear any more, and not seen beside metal: it must come back.
         if float(odds.max()) - log_sum(seen.log_evidence) > MOVED_ODDS:
-            if best[1] == len(odds) - 1:
-                gain = self.gain + COMMON_GAIN * float(best[2][0])
+            if what == len(odds) - 1:
+                gain = self.gain + COMMON_GAIN * float(motion[0])
                 self.gain = gain if abs(gain) > LEAST_GAIN else 0.0
                 return
-            self.reason = self._said(*best[1:])
+            self.reason = self._said(what, motion, sigma)
         elif seen.best == 0:
             self.reason, self._away = '', (0, 0.0)
 
@@ -117,17 +125,24 @@ class FrameMotion:
 
     def _known_of(self, bank: Bank, hypothesis: int, noise: float) -> tuple[Array, Array, Array]:
         """Return what a hypothesis and the noise decide for each thing that may move: the columns
-        (2 + K, n, 6) in its eigenvectors, and for each strength ``(1 + M)^-1`` (2 + K, A, 6, 6)
-        and half of ``log |1 + M|`` (2 + K, A).
+        (n, (2 + K) 6) in its eigenvectors, and for each strength ``L^-1`` (A, 2 + K, 6, 6) of
+        Cholesky's factor ``L L^T = 1 + M`` and half of ``log |1 + M|`` (A, 2 + K).
         """
         key = (bank.rows.tobytes(), bank.names[hypothesis], noise)
         if key not in self._known:
             make_room(self._known, MOST_KEPT)
-            columns = bank.bases[hypothesis].T @ self._columns[:, bank.rows]
+            columns = bank.bases[hypothesis].T @ self._columns[bank.rows]
+            # The upper triangles of all products of two columns, so that one product sums them.
+            first, second = np.triu_indices(6)
+            each = columns.reshape(len(columns), -1, 6)
+            pairs = (each[:, :, first] * each[:, :, second]).reshape(len(columns), -1)
             precision = bank.precision(noise)[0][hypothesis]
-            rows = columns.swapaxes(1, 2)[:, None] * precision[:, None, :]  # (2 + K, A, 6, n)
-            square = rows.reshape(len(rows), -1, rows.shape[3]) @ columns
-            inside = np.eye(6) + square.reshape(*rows.shape[:3], 6)
-            half = 0.5 * np.linalg.slogdet(inside)[1]
-            self._known[key] = columns, np.linalg.inv(inside), half
+            # Nothing has no strength: what is known of one of them is known of all.
+            square = precision[: None if bank.spectra[hypothesis].any() else 1] @ pairs
+            inside = np.empty((len(square), self._things, 6, 6))
+            inside[:, :, first, second] = square.reshape(*inside.shape[:2], -1)
+            inside[:, :, second, first] = inside[:, :, first, second]
+            lower = np.linalg.cholesky(inside + np.eye(6))
+            half = np.log(np.einsum('akii->aki', lower)).sum(axis=2)
+            self._known[key] = columns, np.linalg.inv(lower), half
         return self._known[key]
