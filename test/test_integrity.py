@@ -130,11 +130,14 @@ def test_parts_of_a_bent_tool_contradict_each_other_and_none_is_believed(rng, mo
 
 def test_clusters_that_are_permuted_now_and_then_give_no_pose(rng):
     def permute(i, seen):
-        turned = i >= FAULT and i % 5 == 0
+        turned = FAULT <= i < 60 and i % 5 == 0
         return np.roll(seen[i], -3, axis=0) if turned else seen[i]
 
-    found = track_with(permute, rng)
-    assert {e.state for e in found[FAULT + 1].values()} == {'ok'}
+    found = track_with(permute, rng, count=164)
+    assert {e.state for e in found[FAULT + 1].values()} == {'ok'}, 'one such frame is a chance'
+    assert {e.state for e in found[52].values()} == {'unconfirmed'}
+    assert all('a fault of the line' in e.reason for e in found[52].values())
+    assert {e.state for e in found[-1].values()} == {'ok'}
 
 
 @pytest.mark.parametrize('gate', [8.0, 100.0, 1e6])

@@ -176,10 +176,9 @@ class LayoutPlacer:
 
     def placed(self, layout: Layout) -> tuple[DipoleSites, ComplexArray | None]:
         """Return a layout's dipoles as its rule places them."""
-        if layout.kind == 'drawing' and self.scaled is not None:
-            drawn = self.scaled.nominal
-            return DipoleSites(drawn.positions, drawn.directions), drawn.moments
         dipoles = place(layout, self.generator)
+        if layout.kind == 'drawing' and self.scaled is not None:
+            return dipoles, self.scaled.nominal.moments
         return dipoles, self._prior(layout, dipoles)
 
     def _prior(self, layout: Layout, dipoles: DipoleSites) -> ComplexArray | None:

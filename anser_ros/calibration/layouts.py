@@ -257,6 +257,8 @@ def place(layout: Layout, generator: Generator) -> DipoleSites:
     """Return the dipoles of a layout over a field generator."""
     if layout.kind == 'coils':
         return _on_coils(layout, generator)
+    if layout.kind == 'drawing' and generator.nominal is not None:
+        return DipoleSites(generator.nominal.positions, generator.nominal.directions)
     if layout.kind == 'coaxial':
         count = len(generator.centres)
         upright, spacing = np.tile(UNIT_Z, (count, 1)), np.full(count, FIRST_SPACING_M)

@@ -33,6 +33,11 @@ MOST_REFUSED = 0.5
 """Share (0 to 1) of refused frames from which on a pass is more likely chance than not."""
 START_FRAMES = 3
 """Fewest consecutive frames, the last included, that confirm a pose: two wrong ones may agree."""
+ALTERNATES_S, FEWEST_JUMPS = 2.0, 3
+"""So many jumps within this time, s, to another pose that fits as well, and back, are no motion
+and no chance (once is a damaged record): two worlds take turns, as where a block is late."""
+DETOUR = 3.0
+"""Length of a way by that of the straight one from which on what is between is a jump."""
 LONGEST_RUN_S = 0.25
 """Longest run asked for, s: 12 frames at 50 Hz pass by chance once in 5e5 where a third do."""
 SIGMAS = 3.0
@@ -83,6 +88,13 @@ def motion_contradiction(before: list[Place], now: Place, bounds: MotionBounds) 
     return ''
 
 
+def is_detour(before: Place, away: Place, after: Place) -> bool:
+    """Return whether a place lies nowhere near the way from the one before to the one after it."""
+    by = math.dist(before.position, away.position) + math.dist(away.position, after.position)
+    errors = away.sigma_m + max(before.sigma_m, after.sigma_m)
+    return by > DETOUR * math.dist(before.position, after.position) + 2.0 * SIGMAS * errors
+
+
 class Continuity:
     """Judges one sensor's or body's poses through time."""
 
@@ -94,8 +106,18 @@ class Continuity:
         """Return the share of the last second's frames that were refused in spite of signals."""
         return self._refused / max(len(self._record), 1)
 
+    @property
+    def alternates(self) -> str:
+        """Return that two worlds take turns; empty where they do not."""
+        if len(self._jumps) < FEWEST_JUMPS:
+            return ''
+        times = f'{len(self._jumps)} times within {ALTERNATES_S:g} s'
+        return f'the readings jump to another pose and back, {times}: a fault of the line'
+
     def forget(self) -> None:
         """Forget all frames that were judged so far."""
+        self._jumps: deque[int] = deque()
+        self._away: Place | None = None
         self._track: list[Place] = []
         self._run: list[Place] = []
         self._frames = self._began_ns = self._last_ns = self._refused = 0
@@ -106,13 +128,22 @@ class Continuity:
     ) -> str:
         """Return why the next frame's pose is not confirmed; empty where it is, or there is none.
 
-        ``place`` is that of a pose that is good by itself; ``refused`` says whether there is no
-        pose although there are signals.
+        ``place`` is that of a pose that fits its own readings; ``refused`` says whether there is
+        none that is good although there are signals.
         """
+        other, place = (place, None) if refused else (None, place)
         last_ns = self._last_ns
         alone = not last_ns or not 0 < stamp_ns - last_ns <= STREAM_GAP_S / NANO
         if alone:
             self.forget()
+        if other is not None and self._track and self._track[-1].stamp_ns == last_ns:
+            self._away = other
+        elif place is not None and self._away is not None and self._track:
+            if is_detour(self._track[-1], self._away, place):
+                self._jumps.append(stamp_ns)
+            self._away = None
+        while self._jumps and stamp_ns - self._jumps[0] > ALTERNATES_S / NANO:
+            self._jumps.popleft()
         self._last_ns = stamp_ns
         self._note(stamp_ns, place is None and refused, place is not None or refused)
         if place is None:

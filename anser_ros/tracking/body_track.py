@@ -12,7 +12,7 @@ from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.stamps import NANO
 from anser_ros.tracking import rigid
 from anser_ros.tracking.coil_step import MOST_STEPS, SUSPICIOUS_JUMP_M
-from anser_ros.tracking.coil_track import CoilResult, CoilTracks
+from anser_ros.tracking.coil_track import CoilResult
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve import bounded_inverse
@@ -128,14 +128,10 @@ class BodyResult:
 
 @dataclass
 class BodyFrame(SolveFrame):
-    """Holds a body's fluxes (S, 2K), its coils, what each of these found by itself, and their rows
-    among the tracks.
-    """
+    """Holds a body's fluxes (S, 2K), its coils, and what each of these found by itself."""
 
     coils: rigid.BodyCoils
     single: list[CoilResult]
-    rows: Integers
-    tracks: CoilTracks
 
     @property
     def usable(self) -> Integers:
@@ -148,17 +144,14 @@ class BodyFrame(SolveFrame):
         return 1.0 / self.context.sigma
 
     def common(self, used: Integers, start: Start) -> Array:
-        """Errors that some coils share, see `common_factor`.
-
-        They are those that the coils' own solves reckoned with, where these were near.
-        """
+        """Errors that some coils share, see `common_factor`."""
         weights = np.tile(self.inverse_sigma, (len(used), 1))
         gains = self.coils.subset(used).gain_errors(self.flux[used])
         if self.context.modes is None:
             return rigid.common_factor(gains, weights)
         coils, (position, rotation) = self.coils.subset(used), start
         points, axes = coils.offsets @ rotation.T + position, coils.axes @ rotation.T
-        shared = self.tracks.errors_at(self.rows[used], points, axes, coils.lengths, self.context)
+        shared = self.context.errors_at(points, axes, coils.lengths)
         modes = np.concatenate([shared, gains], axis=1) if gains.shape[1] else shared
         return rigid.common_factor(modes, weights)
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from anser_ros import pose_states as states
-from anser_ros.arrays import Array, Booleans, Integers
+from anser_ros.arrays import Array, Booleans
 from anser_ros.errors import TrackingError
 from anser_ros.stamps import NANO
 from anser_ros.tracking import coil_step
@@ -31,10 +31,6 @@ THOROUGH_EVERY = 4
 """Every so many scans of a long distortion one tries all starts."""
 CHANGED = 3.0
 """A suspect's chi-square that changes by this factor calls for a scan before its time."""
-BODY_SHARE = 0.1
-"""Part of `coil_step.ERROR_REACH` up to which a body reuses what its coils reckoned with. At 1 the
-coils' errors were those of places 6 mm apart, and poses by a drawing were off by 3.5 sigma; 1.9
-are the most at 0.2, 1.7 at 0.1, 1.5 at 0.04."""
 
 
 @dataclass
@@ -115,24 +111,6 @@ class CoilTracks:
         ):  # fmt: skip
             raise TrackingError(NOT_FINITE)
         return out
-
-    def errors_at(
-        self, rows: Integers, points: Array, axes: Array, lengths: Array, context: SolveContext
-    ) -> Array:
-        """Return the model's flux errors (N, R, 2K), T, for coils of some rows at poses (N, 3).
-
-        A body learns them from what its coils differ by, so that each has to be of its own place.
-        """
-        at, memory = self.memory.error_at[rows], self.memory
-        moved = np.sqrt(((points - at[:, :3]) ** 2).sum(axis=1))
-        turned = np.sqrt(((axes - at[:, 3:]) ** 2).sum(axis=1))
-        reach_m, turn = BODY_SHARE * memory.reach_m[rows], BODY_SHARE * coil_step.ERROR_REACH
-        is_far = (moved >= reach_m) | (turned >= turn)
-        far = np.flatnonzero(is_far)
-        shared: Array = memory.errors[rows]
-        if far.size:
-            shared[far] = context.errors_at(points[far], axes[far], lengths[far])
-        return shared
 
 
 @dataclass

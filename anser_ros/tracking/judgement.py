@@ -141,6 +141,8 @@ class Judgement:
         if settings.judges:
             self._add_to_record(stamp_ns, found[: len(coils)])
             found = [self._judged_in_time(estimate, settings) for estimate in found]
+            for i, body in enumerate(bodies):
+                self._take_alternating(found, [*body.rows.tolist(), len(coils) + i])
         return [self._with_stamp_error(e, settings) if e.state == states.OK else e for e in found]
 
     def _add_to_record(self, stamp_ns: int, coils: Estimates) -> None:
@@ -152,7 +154,7 @@ class Judgement:
     def _judged_in_time(self, estimate: PoseEstimate, settings: TrackerSettings) -> PoseEstimate:
         """The estimate, or why it is not given out: its own past, or that of the whole model."""
         place = None
-        if estimate.state == states.OK:
+        if estimate.state in (states.OK, states.INCONSISTENT):
             where = estimate.position.tolist()
             place = Place(estimate.stamp_ns, where, estimate.sigma_position_m)
         continuity = self._continuity.setdefault(estimate.name, Continuity())
@@ -160,11 +162,21 @@ class Judgement:
         bounds = MotionBounds(tools.max_speed_m_s, tools.max_acceleration_m_s2)
         refused = estimate.state in CONTRADICTS
         reason = continuity.judge(estimate.stamp_ns, place, refused, bounds)
-        if place is not None and self.record.is_doubtful:
+        if place is not None and not refused and self.record.is_doubtful:
             return replace(estimate, state=states.MODEL_DOUBTFUL, reason=self.record.reason)
         if reason:
             return replace(estimate, state=states.UNCONFIRMED, reason=reason)
         return estimate
+
+    def _take_alternating(self, found: Estimates, members: list[int]) -> None:
+        """Withhold, in ``found``, a body and its coils while these jump between two worlds: which
+        of them is true, no frame says.
+        """
+        said = (self._continuity[found[row].name].alternates for row in members)
+        if why := next((words for words in said if words), ''):
+            for row in members:
+                if found[row].state == states.OK:
+                    found[row] = replace(found[row], state=states.UNCONFIRMED, reason=why)
 
     def _with_stamp_error(self, estimate: PoseEstimate, settings: TrackerSettings) -> PoseEstimate:
         """The estimate with what the stamp's error makes of its motion in the covariance."""

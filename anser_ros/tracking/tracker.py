@@ -300,10 +300,8 @@ class Tracker:
         frames, bodies = [], []
         for name, (rows, table) in self._scene.bodies.items():
             single = [coils[i] for i in rows]
-            frame = BodyFrame(
-                name, stamp_ns, values[rows], context, self.settings, table, single, rows,
-                self._past.coils,
-            )  # fmt: skip
+            flux = values[rows]
+            frame = BodyFrame(name, stamp_ns, flux, context, self.settings, table, single)
             frames.append(frame)
             if context.symmetry is not None:
                 reason = 'the field is the same all around its axis: a turn about it stays unknown'

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import tampers
 from fault import Fault, Off, nothing
+from line import Tamper
 from rig import BOARD_SEED, Rig
 
 from anser_ros.field.model import EffectRecord, FieldModel
@@ -69,15 +70,18 @@ def _doubled_effect(rig: Rig, _rng: np.random.Generator) -> Off:
     return _restarted(rig, 'tracker', model_file=path)
 
 
-def _no_gate(rig: Rig, rng: np.random.Generator) -> Off:
-    rig.set_parameter('tracker', 'gate', 1e6)
-    rig.line.put('no_gate', tampers.gain(1.05, [4]))
+def _gate(gate: float, make: Callable[[], Tamper]) -> Callable[..., Off]:
+    def on(rig: Rig, _rng: np.random.Generator) -> Off:
+        rig.set_parameter('tracker', 'gate', gate)
+        rig.line.put('gate', make())
 
-    def off() -> None:
-        rig.line.take_off('no_gate')
-        rig.set_parameter('tracker', 'gate', 5.0)
+        def off() -> None:
+            rig.line.take_off('gate')
+            rig.set_parameter('tracker', 'gate', 5.0)
 
-    return off
+        return off
+
+    return on
 
 
 MODELS = (
@@ -99,6 +103,10 @@ MODELS = (
           'metal', spoils=True),
     Fault('doubled-effect', "the tracker's file has an effect that the model served has not",
           _doubled_effect, 4.0),
-    Fault('no-gate', 'gate set to 1e6 live, and a gain of 5 %', _no_gate, 4.0),
+    *(Fault(f'gate-{gate:.0f}', f'gate set to {gate:g} live, and {what}', _gate(gate, make), 6.0)
+      for gate, what, make in (
+          (1e6, 'two coils swapped', lambda: tampers.swapped(0, 4)),
+          (100.0, 'a gain of 3 % on all coils', lambda: tampers.gain(1.03, tampers.TOOL)),
+          (20.0, 'a gain of 2 % on all coils', lambda: tampers.gain(1.02, tampers.TOOL)))),
 )  # fmt: skip
 """Models that are wrong."""

@@ -20,7 +20,7 @@ import numpy as np
 from fault import Command, Fault, nothing
 from faults_files import COMMANDS
 from faults_graph import GRAPH
-from faults_line import CLOCK, REFERENCES, SERIAL
+from faults_line import CLOCK, REFERENCES, SERIAL, TOGETHER
 from faults_models import MODELS
 from faults_processes import PROCESSES
 from recorded import RECORDED, Drift
@@ -36,7 +36,7 @@ CONTROL = (
 )
 GROUPS: dict[str, tuple[Fault, ...]] = {
     'control': CONTROL, 'serial': SERIAL, 'clock': CLOCK, 'references': REFERENCES,
-    'models': MODELS, 'graph': GRAPH, 'processes': PROCESSES,
+    'together': TOGETHER, 'models': MODELS, 'graph': GRAPH, 'processes': PROCESSES,
 }  # fmt: skip
 RECOVERY_S = 12.0
 """Longest wait for poses after a fault has gone, s; then the chain is started anew."""
@@ -45,7 +45,7 @@ AFTER_S = 1.0
 UNIT_LATE_S = 0.003
 """Lateness of the simulated unit itself, s, on a busy machine, from which on a pose is not judged:
 at the tools' 0.1 m/s it makes a third of a millimetre."""
-TOGETHER = (2, 3)
+AT_ONCE = (2, 3)
 """Least and most faults of a random combination."""
 
 
@@ -112,7 +112,7 @@ def tried(chain: Chain, faults: Sequence[Fault], seed: int, lasts_s: float | Non
     if any(fault.spoils for fault in faults):
         chain.end()
     worst, error = max(bad, key=lambda one: one[1], default=(None, None))
-    group = next((g for g, all_ in GROUPS.items() if faults[0] in all_), 'together')
+    group = next((g for g, all_ in GROUPS.items() if faults[0] in all_), 'several')
     return Row(
         group, _name(faults), ' and '.join(fault.what for fault in faults),
         said=heard[0] if heard else '',
@@ -177,7 +177,7 @@ def combinations(seed: int, count: int) -> list[list[Fault]]:
     rng = np.random.default_rng(seed)
     pool = [f for group in GROUPS.values() for f in group if f.combines]
     return [
-        [pool[i] for i in rng.choice(len(pool), int(rng.integers(TOGETHER[0], TOGETHER[1] + 1)),
+        [pool[i] for i in rng.choice(len(pool), int(rng.integers(AT_ONCE[0], AT_ONCE[1] + 1)),
                                      replace=False)]
         for _ in range(count)
     ]  # fmt: skip
@@ -261,7 +261,7 @@ def _tried_surely(chain: Chain, faults: Sequence[Fault], args: argparse.Namespac
     except (RuntimeError, OSError) as error:
         chain.end()
         names = _name(faults)
-        return Row('together', names, names, '', None, 0, 0, None, None, None, (str(error),))
+        return Row('several', names, names, '', None, 0, 0, None, None, None, (str(error),))
 
 
 if __name__ == '__main__':

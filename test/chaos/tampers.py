@@ -43,6 +43,25 @@ def gain(factor: float, where: object) -> Tamper:
     return columns(lambda codes: factor * codes, where)
 
 
+def drifting(per_second: float, where: object, rate_hz: float) -> Tamper:
+    """Let the gain of columns grow by so much a second."""
+    seen = itertools.count()
+    return columns(lambda codes: codes * (1.0 + per_second * next(seen) * len(codes) / rate_hz),
+                   where)  # fmt: skip
+
+
+def sometimes_permuted(order: Sequence[int], samples: int, every: int) -> Tamper:
+    """Permute the tool's columns in one stretch of so many samples of so many stretches."""
+    seen = itertools.count()
+
+    def change(codes: np.ndarray) -> None:
+        place = np.array([next(seen) for _ in codes]) // samples
+        late = place % every == 0
+        codes[late, : len(order)] = codes[late][:, order]
+
+    return _in_place(change)
+
+
 def offset(codes_up: float, where: object) -> Tamper:
     """Shift columns by a constant."""
     return columns(lambda codes: codes + codes_up, where)
@@ -215,11 +234,6 @@ def lost(share: float, rng: np.random.Generator) -> Tamper:
     return each(lambda _record: [], share, rng)
 
 
-def doubled(share: float, rng: np.random.Generator) -> Tamper:
-    """Let a share of the records arrive twice."""
-    return each(lambda record: [record, record], share, rng)
-
-
 def replayed(seconds: float) -> Tamper:
     """Let all records of the first seconds arrive again and again in place of the live ones."""
     kept: list[bytes] = []
@@ -303,13 +317,6 @@ def hello_scaled(**factors: float) -> Tamper:
         hello=lambda given: replace(
             given, **{k: getattr(given, k) * f for k, f in factors.items()}
         )
-    )
-
-
-def scaled_channels(factor: float) -> Callable[[Hello], Hello]:
-    """Return what multiplies the full scale of all channels."""
-    return lambda given: replace(
-        given, channels=tuple(replace(c, full_scale=factor * c.full_scale) for c in given.channels)
     )
 
 

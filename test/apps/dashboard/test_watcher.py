@@ -140,6 +140,25 @@ class TestWatch:
         assert seen.excess > 10 and seen.findings == () and not seen.is_clear
         assert 'moves too little' in seen.remark and watch.searches == 0
 
+    def test_a_bend_that_stays_is_named(self, moving, watch):
+        (tool,), model, flux = (
+            load_session(MOVING).tools,
+            load_model(MODEL),
+            moving.tool.flux + 0.0,
+        )
+        aside = np.where(np.arange(9)[:, None] < 3, [0.0018, 0.0024, 0.0], 0.0)
+        for f, (place, turn) in enumerate(zip(tool.position, tool.rotation, strict=True)):
+            own, length = tool.sensors.axis @ turn.T, tool.sensors.length
+            for sign, local in (
+                (1.0, tool.sensors.position + aside),
+                (-1.0, tool.sensors.position),
+            ):
+                flux[f] += sign * model.flux(local @ turn.T + place, own, length)
+        window = filled(replace(moving, tool=replace(moving.tool, flux=flux)), optical=False)
+        (found,) = watch.look(window.session(), window.first_ns).findings
+        assert (found.name, found.parameters['channels']) == ('sensor_position', [0, 1, 2])
+        assert found.parameters['offset_m'] == pytest.approx(aside[0], abs=2e-5)
+
     def test_too_few_frames_are_refused(self, moving, watch):
         window = filled(moving, length_s=1.0, frames=20)
         with pytest.raises(DiagnosisError, match='at least 30 frames'):
