@@ -12,7 +12,7 @@ from anser_ros.apps.poses.effect import PoseTerm, Role, effect_with
 from anser_ros.apps.poses.problem import PoseProblem
 from anser_ros.apps.poses.sequence import REFERENCE, PoseSequence, PoseSession
 from anser_ros.arrays import Array
-from anser_ros.errors import PlausibilityError
+from anser_ros.errors import DiagnosisError, PlausibilityError
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.plausibility import check_positions
 from anser_ros.wire.table_names import LENGTH_M
@@ -60,7 +60,7 @@ class PoseReading:
         """
         effect = effect_with(Role.READING)
         evidence = {'misfit_as_written_m': before, 'misfit_so_read_m': after,
-                    'extent_ratio': ratio, 'summary': effect.summary}  # fmt: skip
+                    'extent_ratio': ratio, **effect.words}  # fmt: skip
         return EffectRecord(effect.name, dict(vars(self)), {}, evidence)
 
     def applied(self, session: PoseSession) -> PoseSession:
@@ -93,6 +93,9 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
     """
     if session.reference is None:
         return session, None
+    if not session.reference.size:
+        lost = session.reference.missing.size
+        raise DiagnosisError(f'{session.path}: no pose of the reference, {lost} missing')
     check_positions(f'{session.path}: the reference', session.reference.position)
     ratio = _extent_ratio(session)
     unit = _unit(ratio)

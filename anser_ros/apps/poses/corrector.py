@@ -11,6 +11,7 @@ from anser_ros.apps.poses.convention import PoseReading
 from anser_ros.apps.poses.diagnosis import PoseDiagnosis
 from anser_ros.apps.poses.effect import SMOOTH, PoseMap, Role, effect_of_record, effect_with
 from anser_ros.apps.poses.hand_eye import PoseClock
+from anser_ros.apps.poses.problem import noise_table
 from anser_ros.apps.poses.sequence import FARTHEST, NO_TURN, PoseSequence, PoseSession
 from anser_ros.arrays import Array
 from anser_ros.calibration.error_map import ErrorMap
@@ -33,6 +34,7 @@ def to_document(found: PoseDiagnosis) -> dict[str, Any]:
             **_rms(before.position_m, before.orientation_rad, after.position_m,
                    after.orientation_rad),
             'position_rmse_registration_only_m': registered.position_m,
+            'position_rmse_outside_episodes_m': found.outside_m,
             'position_floor_m': found.floor_m,
         },
         'sensors': {
@@ -42,6 +44,7 @@ def to_document(found: PoseDiagnosis) -> dict[str, Any]:
             }
             for name in after.by_sensor
         },
+        'noise': noise_table(found.fit.state),
         'effects': [{**vars(record), 'flux_rms_without_t': None} for record in found.records],
         'unexplained': {'fraction': found.unexplained, 'depends_on': found.depends_on},
         'left_out': found.left_out,
@@ -234,12 +237,13 @@ def corrected(session: PoseSession, document: Mapping[str, Any]) -> PoseSession:
 
     Raises `ModelFileError` when it knows none, or is no model of poses.
     """
-    corrector, sensors = PoseCorrector(document), {}
+    corrector, sensors, states = PoseCorrector(document), {}, []
     for name in (n for n in session.sensors if n in corrector.sensors):
         poses = session.sensors[name]
         stamps = session.start_ns + np.round(1e9 * poses.time).astype(np.int64)
         rows = zip(stamps.tolist(), poses.position, poses.quaternion, strict=True)
         done = [corrector.correct(name, *row) for row in rows]
+        states += [one.state for one in done]
         time = 1e-9 * np.array([one.stamp_ns - session.start_ns for one in done])
         place, turn = (np.array([getattr(one, k) for one in done]).reshape(-1, n)
                        for k, n in (('position', 3), ('quaternion', 4)))  # fmt: skip
@@ -247,4 +251,9 @@ def corrected(session: PoseSession, document: Mapping[str, Any]) -> PoseSession:
     if not sensors:
         known = ', '.join(sorted(corrector.sensors))
         raise ModelFileError(f'the model knows {known}, the session {", ".join(session.sensors)}')
-    return replace(session, sensors=sensors)
+    words = [session.lost] if session.lost else []
+    if outside := states.count(OUTSIDE):
+        words.append(
+            f'{outside} of {len(states)} poses lie outside the places where the model was learnt'
+        )
+    return replace(session, sensors=sensors, lost='; '.join(words))

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.apps.poses import start
 from anser_ros.apps.poses.convention import read_rightly
 from anser_ros.apps.poses.effect import PoseTerm, PoseView, Role, pose_effects
-from anser_ros.apps.poses.effects.episodes import in_episode
+from anser_ros.apps.poses.effects.episodes import episode, in_episode, windows_of
 from anser_ros.apps.poses.fit import (
     PoseFit,
     fit_poses,
@@ -227,8 +227,9 @@ class PoseDiagnosis:
     fit: PoseFit  # the two frames and all effects, on all poses
     records: tuple[EffectRecord, ...]  # the effects that are named
     registered: HeldOutErrors  # held out, with the registration alone
-    floor_m: float  # what jitter alone would leave, m
-    unexplained: float  # share of the squared error above the jitter that stays
+    outside_m: float  # held-out error with the effects, outside the episodes that are named, m
+    floor_m: float  # what jitter alone would leave of it, m
+    unexplained: float  # share of its square above the jitter that stays
     depends_on: tuple[str, ...]
     refused: tuple[tuple[str, str], ...]
     states: tuple[PoseState, PoseState]  # the held-out poses with hand-eye, and with the effects
@@ -291,31 +292,33 @@ def diagnose_poses(
         search = replace(search, fit=alone_fit, evidence=(None,) * len(alone_fit.terms))
     search = _confirmed(search, problem, test)
     found = search.fit
-    whole = with_time_constants(fit_poses(judged(problem, found), found.terms))
+    whole = _on_all(session, problem, found, is_searched and search.knows_levers)
     own = problem.rows([poses.time >= begin for poses in problem.sensors])
     before, after, registered = held_out(own, found, test)
-    floor = floor_of(after)
     residuals = _residuals(session, problem, whole)
     records = records_of(whole, search.evidence, session)
     most = most_poses(session)
     is_known = search.knows_levers and knows_levers(whole, most)
     for effect in pose_effects().values() if is_searched else ():
-        words = {'summary': effect.summary, 'advice': effect.advice}
         seen = effect.observed(residuals) if is_known or not effect.needs_levers else ()
-        records += [replace(r, evidence={**words, **r.evidence}) for r in seen]
+        records += [replace(r, evidence={**effect.words, **r.evidence}) for r in seen]
     records += [*exchanged, *swapped, *([] if convention is None else [convention])]
-    errors = errors_of(after)
-    excess = max(errors.position_m**2 - floor**2, 0.0)
-    possible = max(errors_of(before).position_m ** 2 - floor**2, excess, 1e-18)
-    significant = errors.position_m > max(ABOVE_FLOOR * floor, LEAST_REPORTED_M)
+    loud, quiet = before, after
+    if is_searched and is_known:
+        loud, quiet = (_outside(state, residuals) for state in (before, after))
+    floor, (error, _) = floor_of(quiet), quiet.rms()
+    excess = max(error**2 - floor**2, 0.0)
+    possible = max(loud.rms()[0] ** 2 - floor**2, excess, 1e-18)
+    significant = error > max(ABOVE_FLOOR * floor, LEAST_REPORTED_M)
     return PoseDiagnosis(
         session=session,
         fit=whole,
         records=tuple(records),
         registered=registered,
+        outside_m=error,
         floor_m=floor,
         unexplained=excess / possible if significant else 0.0,
-        depends_on=(depends_on(after) or depends_on(whole.state)) if significant else (),
+        depends_on=(depends_on(quiet) or depends_on(whole.state)) if significant else (),
         refused=search.refused,
         states=(before, after),
         left_out=tuple(
@@ -325,6 +328,31 @@ def diagnose_poses(
         ),
         knows_levers=search.knows_levers,
     )
+
+
+def _on_all(
+    session: PoseSession, problem: PoseProblem, found: PoseFit, has_episodes: bool
+) -> PoseFit:
+    """What was found, fitted to all poses; outside episodes if these tell the lever arms."""
+    whole = with_time_constants(fit_poses(judged(problem, found), found.terms))
+    if not has_episodes:
+        return whole
+    outside = _outside(
+        judged(problem, found).state(found.terms), _residuals(session, problem, whole)
+    )
+    quiet = with_time_constants(fit_poses(outside.problem, found.terms))
+    return quiet if knows_levers(quiet, most_poses(session)) else whole
+
+
+def _outside(state: PoseState, residuals: PoseResiduals) -> PoseState:
+    """A state without the poses of episodes, which have their reason."""
+    inside = {s.view.sensor: s.view.time[in_episode(s, residuals)] for s in residuals.sensors}
+    parts = [
+        replace(p, weight=np.where(np.isin(p.view.time, inside[p.view.sensor]), 0.0, p.weight))
+        for p in state.parts
+    ]
+    problem = replace(state.problem, weight=tuple(p.weight for p in parts))
+    return replace(state, problem=problem, parts=tuple(parts))
 
 
 def _behind(baseline: PoseSession, session: PoseSession, begin: float) -> PoseSession:
@@ -348,18 +376,23 @@ def _behind(baseline: PoseSession, session: PoseSession, begin: float) -> PoseSe
 def _outside_episodes(
     search: PoseSearch, session: PoseSession, say: Callable[[str], None]
 ) -> PoseSearch:
-    """The search, again without the poses of episodes, which a map that it found may follow."""
+    """The search, again without the poses of episodes, which frames and maps may follow."""
     problem = search.fit.state.problem
     rest = [t for t in search.fit.terms if t.role is not Role.MAP]
-    if len(rest) == len(search.fit.terms):
+    if not search.knows_levers:
         return search
-    plain = with_noise(fit_poses(problem, rest))
+    plain = search.fit
+    if len(rest) < len(plain.terms):
+        plain = with_noise(fit_poses(problem, rest))
     residuals = _residuals(session, problem, plain)
-    inside = [in_episode(sensing, residuals) for sensing in residuals.sensors]
-    if not np.concatenate(inside).any():
+    off = {w for one in residuals.sensors for w in episode(one, residuals).windows}
+    if not off:
         return search
+    # What one sensor passes is near the others on its body.
+    inside = [np.isin(windows_of(one, residuals), list(off)) for one in residuals.sensors]
     cut = plain.state.problem.rows([~mask for mask in inside])
-    return search_effects(fit_poses(cut, frame_terms(rest)), session, say)
+    again = search_effects(fit_poses(cut, frame_terms(rest)), session, say)
+    return again if again.knows_levers else search
 
 
 def _confirmed(search: PoseSearch, problem: PoseProblem, test: Integers) -> PoseSearch:

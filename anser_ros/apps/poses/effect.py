@@ -149,6 +149,11 @@ class PoseEffect(BaseEffect[PoseTerm]):
     makes_jitter = False
     """Whether poses that jitter more than before are explained by it."""
 
+    @property
+    def words(self) -> dict[str, object]:
+        """Return what it is and what to do, for the evidence of its records."""
+        return {'summary': self.summary, 'advice': self.advice}
+
     def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
         """Return the effect at every site where it may sit, with parameters of zero."""
         return ()

@@ -17,9 +17,14 @@ from anser_ros.apps.poses.effect import PoseTerm, Role, effect_with
 from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState, stamp_step
 from anser_ros.apps.poses.sequence import PoseSequence, PoseSession
 from anser_ros.arrays import Array, Booleans
-from anser_ros.diagnosis.engine import JointFit, descended, stepped
+from anser_ros.diagnosis.engine import JointFit, block_sums, descended, joined, stepped
 from anser_ros.effects.effect import sigmas
 
+EVEN = np.array([
+    (np.outer(a, b) + np.outer(b, a)) / np.sqrt(2 + 2 * (a @ b))
+    for i, a in enumerate(np.eye(3)) for b in np.eye(3)[i:]
+])  # fmt: skip
+"""Even matrices of unit size, six by 3 x 3."""
 STUDENT_FREEDOM = 4.0
 """Degrees of freedom of Student's t in robust fits: between the mean (infinite) and Cauchy (1)."""
 REWEIGHTINGS = 5
@@ -69,6 +74,39 @@ class PoseFit(JointFit[PoseState]):
             own = self.rows(index)
             scale[own] = np.sqrt(1 + strain_variance(self) / np.diag(whole)[own])
         return np.asarray(whole * scale[:, None] * scale[None, :])
+
+    @cached_property
+    def faked_levers(self) -> dict[str, Array]:
+        """Return the variance (3,), m^2, of each sensor's lever arm that smooth errors make.
+
+        An error that goes with the turn (rad, of the body from its middle) by any matrix is alike
+        in nine ways. Three of them, of its odd part, are a lever arm; the scatter of the six
+        others, less what noise makes of it, is that of any: a twelfth for each, and six tell it to
+        3/2 (Student's t). A space that is stretched, which no map takes up, stretches the lever
+        arm too, and nothing of it stays.
+        """
+        state, sensors = self.state, len(self.state.parts)
+        columns: list[Array | None] = []
+        for k, part in enumerate(state.parts):
+            turns = Rotation.from_matrix(part.view.turn)
+            middle = turns[part.used].mean() if part.used.any() else turns.mean()
+            about = part.view.frame @ middle.as_matrix()
+            own = np.zeros((*part.residual.shape, 6 * sensors))
+            moved = np.einsum('ij,mjk,nk->nim', about, EVEN, (middle.inv() * turns).as_rotvec())
+            own[:, :3, 6 * k : 6 * k + 6] = moved
+            white = part.noise.whitened(own, part.view.velocity)
+            columns.append(white * part.weight[:, None, None])
+        sums = block_sums(state.parts, joined([state.designs(state.terms), columns]), self.blocks)
+        prior = np.concatenate([self.prior, np.full(6 * sensors, LEAST_KNOWN_M)])
+        values, spread = sums.solve(prior)[0], np.diag(sums.covariance(prior, self.misfit))
+        other = (values**2 - spread)[self.prior.size :].reshape(sensors, 6).sum(axis=1)
+        roles = {term.role for term in state.terms}
+        is_bent = Role.MAP in roles and Role.SCALE not in roles
+        strain = 0.0 if is_bent else 1e-6 * strain_variance(self)
+        return {
+            p.view.sensor: max(float(one), 0.0) / 8 + strain * p.view.lever**2
+            for p, one in zip(state.parts, other, strict=True)
+        }
 
     @cached_property
     def noise_covariance(self) -> Array:
@@ -225,8 +263,7 @@ def noise_of(part: PosePart, with_stamps: bool = True) -> tuple[PoseNoise, float
         plain = PoseNoise(float(start[0]), float(start[1]))
         return plain, cost(np.log(start)) * len(residual)
     tries = [np.log([start[0], start[1], stamp]) for stamp in (0.002, 0.02)]
-    options = {'xatol': 1e-3, 'fatol': 1e-6, 'maxiter': 300}
-    found = [minimize(cost, at, method='Nelder-Mead', options=options) for at in tries]
+    found = [minimize(cost, at, method='BFGS') for at in tries]
     best = min(found, key=lambda result: float(result.fun))
     values = np.exp(best.x)
     stamp = min(float(values[2]), LARGEST_STAMP_S)

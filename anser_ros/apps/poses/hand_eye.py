@@ -107,8 +107,7 @@ def records_of(
         spread = fit.covariance_of(index)
         record = term.effect.seen_at(term.effect.record(term, spread), term, spread, views)
         words = {
-            'summary': term.effect.summary,
-            'advice': term.effect.advice,
+            **term.effect.words,
             'remedy': term.effect.remedy.value,
             'parameters_spent': int(term.theta.size),
             **one._asdict(),
@@ -133,7 +132,8 @@ def hand_eye_record(fit: PoseFit, index: int, jitter_rad: float) -> EffectRecord
         'registration_rotation_deg': None, 'registration_translation_m': None,
     }  # fmt: skip
     uncertainty: dict[str, object] = {
-        'lever_arm_m': sigma[:3].tolist(), 'mount_rotation_deg': np.rad2deg(sigma[3:]).tolist(),
+        'lever_arm_m': np.sqrt(sigma[:3] ** 2 + fit.faked_levers[name]).tolist(),
+        'mount_rotation_deg': np.rad2deg(sigma[3:]).tolist(),
     }  # fmt: skip
     for base in (i for i, t in enumerate(fit.terms) if t.role is Role.REGISTRATION):
         apart = sigmas(fit.covariance_of(base))
@@ -286,7 +286,8 @@ def _described(
         vector, quaternion = turn_of(frames.mount) if known else (None, None)
         left, unseen = fit.state.rms(name), held_out.get(name, (np.nan, np.nan))
         sensors[name] = {
-            'lever_arm_m': np.array(lever), 'lever_arm_sigma_m': sigma[:3],
+            'lever_arm_m': np.array(lever),
+            'lever_arm_sigma_m': np.array(record.uncertainty['lever_arm_m']),
             'mount_rotation_deg': vector, 'mount_rotation_sigma_deg': np.rad2deg(sigma[3:]),
             'mount_quaternion_xyzw': quaternion,
             'n': int(np.count_nonzero(part.used)), 'n_compared': len(part.used),

@@ -6,6 +6,7 @@ Errors of poses and stamps themselves: jitter between neighbours, and grids of p
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
@@ -123,7 +124,7 @@ def predicted(
     return view, residual, known
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PosePart:
     """Holds one sensor's prediction and residual."""
 
@@ -150,7 +151,7 @@ class PosePart:
         return 6 * int(np.count_nonzero(self.used))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sensing(PosePart):
     """Holds what one sensor shows once the frames and effects are fitted."""
 
@@ -158,7 +159,7 @@ class Sensing(PosePart):
     stamp_gain: float  # minus twice the log likelihood that an error of the stamps takes off
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseResiduals:
     """Holds a session and what its fit leaves, by which some effects are seen without a fit."""
 
@@ -336,10 +337,41 @@ def jitter(part: PosePart, used: Booleans, is_stamped: bool) -> tuple[Array, Arr
     second = _across(second, along[1:-1])
     usual = float(np.median(np.diff(time)))
     near = time[2:] - time[:-2] < max(NEAR_S, NEAR_STEPS * usual)
-    square = np.sum(second**2, axis=1) / (1.5 * 2)
+    free = 3 - np.sum(along[1:-1] ** 2, axis=1)  # two, or three coordinates at rest
+    square = np.sum(second**2, axis=1) / (1.5 * free)
     distance = np.linalg.norm(part.view.measured[rows], axis=1)
     about = np.stack([distance[:-2], distance[1:-1], distance[2:]], axis=1)
     return square[near], about[near]
+
+
+RANGES = 3  # groups of a sensor's poses by their distance, as a data sheet has them
+
+
+def noise_table(state: PoseState) -> list[dict[str, Any]]:
+    """Return the noise of each sensor by its distance from the field generator, and by speed.
+
+    Of a coordinate, between neighbours: in m for poses slower and faster than ``speed_m_s``, the
+    median speed, and in rad; None where there are too few.
+    """
+    parts = [part for part in state.parts if part.used.any()]
+    speeds = [np.linalg.norm(part.view.velocity[:, :3], axis=1) for part in parts]
+    used = [speed[part.used] for speed, part in zip(speeds, parts, strict=True)]
+    middle, rows = float(np.median(np.concatenate(used))), []
+    for part, speed in zip(parts, speeds, strict=True):
+        turned = replace(part, residual=np.roll(part.residual, 3, axis=1))
+        far = np.linalg.norm(part.view.measured, axis=1)
+        for low, high in pairwise(np.quantile(far[part.used], np.linspace(0, 1, 1 + RANGES))):
+            near, row = part.used & (low <= far) & (far <= high), {}
+            for key, one, chosen, is_stamped in (
+                ('slow_m', part, speed <= middle, part.noise.stamp_s > 0),
+                ('fast_m', part, speed > middle, part.noise.stamp_s > 0),
+                ('turn_rad', turned, near, False),
+            ):
+                square = jitter(one, near & chosen, is_stamped)[0]
+                row[key] = float(np.sqrt(np.mean(square))) if square.size else None
+            place = {'from_m': float(low), 'to_m': float(high), 'speed_m_s': middle}
+            rows.append({'sensor': part.view.sensor, **place, **row})
+    return rows
 
 
 def _across(vectors: Array, along: Array) -> Array:

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
+from scipy.linalg import solve_banded
 from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import AnyArray, Array, Booleans
@@ -395,12 +396,12 @@ def filtered(path: OpticalPath, tau: float, two_sided: bool = False) -> OpticalP
     keep = float(np.exp(-step / tau))
     # A straight line between samples goes through the filter exactly.
     late = (1 - keep) * tau / step
-    from scipy.signal import lfilter  # takes half a second, that every command would wait
-
-    passed = values
+    passed, size = values, grid.size
+    recursion = np.stack([np.ones(size), np.full(size, -keep)])
     for way in (1, -1) if two_sided else (1,):
-        turned = passed[::way]
-        driven = lfilter([1 - late, late - keep], [1.0, -keep], turned - turned[0], axis=0)
-        passed = (driven + turned[0])[::way]
+        moved = passed[::way] - passed[::way][0]
+        driven = (1 - late) * moved
+        driven[1:] += (late - keep) * moved[:-1]
+        passed = (solve_banded((1, 0), recursion, driven) + passed[::way][0])[::way]
     spline = CubicHermiteSpline(grid, passed, np.gradient(passed, grid, axis=0))
     return OpticalPath(grid, path.longest_gap, path.is_at_rest, spline, path)

@@ -535,8 +535,7 @@ def put_back(
         share = float(np.mean(masks[0]))
         values = {'sensors': [one, other], 'fraction': share, 'spans': [list(s) for s in spans]}
         effect = effect_with(Role.SWAP)
-        evidence = {'summary': effect.summary, 'remedy': 'the names are put back'}
-        records.append(EffectRecord(effect.name, values, {}, evidence))
+        records.append(EffectRecord(effect.name, values, {}, effect.words))
     return replace(session, sensors=sensors), records
 
 

@@ -201,7 +201,8 @@ def test_a_model_corrects_and_judges_another_session(bent, tmp_path, capsys):
     before = json.loads((out / 'evaluation.json').read_text())['held_out']
     assert before['position_rmse_after_m'] == before['position_rmse_before_m']
     assert main(['evaluate', *plain, '--model', str(path)]) == 0
-    assert 'before, mm' in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert 'before, mm' in said.out and 'lie outside the places' in said.err
     after = json.loads((out / 'evaluation.json').read_text())['held_out']
     assert after['position_rmse_before_m'] == pytest.approx(before['position_rmse_after_m'])
     assert after['position_rmse_after_m'] < 0.3 * after['position_rmse_before_m']

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses.cli.pose_session import sizes
 from anser_ros.apps.poses.diagnosis import depends_on
-from anser_ros.apps.poses.effect import PoseSetting, Role
+from anser_ros.apps.poses.effect import PoseSetting, Role, pose_effects
 from anser_ros.apps.poses.effects.episodes import PoseMovingMetal
 from anser_ros.apps.poses.effects.field_distortion import FieldDistortion
 from anser_ros.apps.poses.effects.frames import PoseClockRate
-from anser_ros.apps.poses.effects.stream import ReceiptJitter, power_law, stamp_step
+from anser_ros.apps.poses.effects.stream import ReceiptJitter, power_law, stamp_step, sudden_poses
 from anser_ros.apps.poses.fit import is_lever_determined
 from anser_ros.apps.poses.hand_eye import one_clock
 from anser_ros.apps.poses.problem import PoseNoise
@@ -25,6 +25,12 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
 SETTING = PoseSetting(('sensor_0', 'sensor_1'), 0.0, 40.0, np.zeros(3), 0.06)
+
+
+class Plain(SimpleNamespace):
+    """Stands for residuals, by which episodes are found once."""
+
+    __hash__ = object.__hash__
 
 
 def test_the_clock_undoes_a_rate_exactly():
@@ -190,11 +196,9 @@ def episodes_of(spans, *, returns=False, shared_m=0.0):
         still, noise = np.zeros((time.size, 6)), PoseNoise(3e-4, 3e-4)
         view = SimpleNamespace(sensor=f'sensor_{k}', time=time, measured=place, velocity=still)
         every = np.ones(time.size, dtype=bool)
-        sensors.append(
-            SimpleNamespace(view=view, residual=residual, noise=noise, used=every, out=~every)
-        )
+        sensors.append(Plain(view=view, residual=residual, noise=noise, used=every, out=~every))
     setting = PoseSetting(('sensor_0', 'sensor_1', 'sensor_2'), 0.0, 40.0, np.zeros(3), 0.1)
-    return PoseMovingMetal().observed(SimpleNamespace(sensors=sensors, setting=setting))
+    return PoseMovingMetal().observed(Plain(sensors=sensors, setting=setting))
 
 
 def test_the_exponent_of_noise_is_found_with_an_honest_sigma():
@@ -280,7 +284,48 @@ def test_recordings_at_rest_one_after_the_other_are_compared_whole():
          ['start: 6.7 s', 'sensors: [tip]']),
         ({'spans': [[3.25, 5.91], [7.0, 8.0]], 'quaternion': 'wxyz'}, {},
          ['spans: 3.2 to 5.9, 7.0 to 8.0 s', 'quaternion: scalar first']),
+        ({'times_s': {'tip': [1.5, 20.25], 'pen': []}, 'recordings': {'tip': [1, 3], 'pen': []}},
+         {}, ['tip at 1.50 (recording 1), 20.25 (recording 3) s']),
     ],
 )  # fmt: skip
 def test_sizes_are_told_in_the_units_of_a_clinic(parameters, sigmas, lines):
     assert [line.replace('\xa0', ' ') for line in sizes(parameters, sigmas)] == lines
+
+
+def test_every_name_says_what_to_do():
+    named = [effect for effect in pose_effects().values() if not effect.role.is_frame]
+    assert all(effect.words['summary'] and effect.words['advice'] for effect in named)
+
+
+def test_an_error_that_comes_and_goes_gradually_is_no_outlier():
+    size = np.zeros(60)
+    size[8:17] = [1, 2, 4, 6, 8, 6, 4, 2, 1]
+    size[[30, 40, 41, 42]] = 50  # one pose in the marker's other solution, and three in a row
+    sensing = SimpleNamespace(
+        used=size <= 3, out=size > 3, noise=PoseNoise(4e-4, 3e-3),
+        residual=1e-3 * size[:, None] * np.eye(6)[0],
+        view=SimpleNamespace(velocity=np.zeros((60, 6))),
+    )  # fmt: skip
+    assert np.flatnonzero(sudden_poses(sensing)).tolist() == [30, 40, 41, 42]
+
+
+def test_errors_that_go_with_turns_are_in_the_sigma_of_a_lever_arm():
+    found = []
+    for seed in range(5):
+        world = World(seed, duration=20.0, sensors=1)
+        matrix = 2e-3 * np.random.default_rng(seed).normal(size=(3, 3))  # m a rad
+
+        def after(streams, matrix=matrix):
+            turns = Rotation.from_quat(streams['sensor_0'][2])
+            streams['sensor_0'][1] += (turns.mean().inv() * turns).as_rotvec() @ matrix
+            return streams
+
+        world.after = after
+        problem = pose_problem(world.session())
+        fit = with_noise(first_fit(problem, coarse_clock(problem), False))
+        index = next(i for i, t in enumerate(fit.terms) if t.role is Role.MOUNT)
+        variance = np.diag(fit.covariance_of(index))[:3]
+        error = fit.terms[index].theta[:3] - world.levers[0]
+        found.append([error**2 / variance, error**2 / (variance + fit.faked_levers['sensor_0'])])
+    without, honest = np.sqrt(np.mean(found, axis=(0, 2)))
+    assert without > 4 and 0.5 < honest < 2.0  # of fifteen values

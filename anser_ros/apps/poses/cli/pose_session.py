@@ -20,7 +20,7 @@ from anser_ros.apps.poses.corrector import corrected, to_document, to_model
 from anser_ros.apps.poses.diagnosis import PoseDiagnosis, diagnose_poses
 from anser_ros.apps.poses.effect import Role, effect_with
 from anser_ros.apps.poses.importing import read_pose_session
-from anser_ros.apps.poses.problem import PoseState, jitter, predicted
+from anser_ros.apps.poses.problem import PoseState, predicted
 from anser_ros.apps.poses.sequence import PoseSession
 from anser_ros.arrays import Array
 from anser_ros.cli import output
@@ -48,8 +48,9 @@ from anser_ros.wire.text_files import read_document
 UNUSED = ('refit', 'baseline', 'references', 'witnesses', 'in_phase', 'known_metal', 'resurveyed',
           'stated')  # fmt: skip
 """Options of other sessions."""
-UNSHOWN = ('centre_m', 'size_m', 'lowest', 'is_equal', 'middle_s', 'degree', 'strain')
-"""Parameters that tell how a map or a course is written, and not what it does."""
+UNSHOWN = ('centre_m', 'size_m', 'lowest', 'is_equal', 'middle_s', 'degree', 'strain', 'times_s',
+           'recordings')  # fmt: skip
+"""Parameters that tell how a map or a course is written, and what has lines of its own."""
 SCALES = {'s': (1e3, 'ms'), 'm': (1e3, 'mm'), 'rad': (180 / math.pi, 'deg'), 'deg': (1.0, 'deg'),
           'ppm': (1.0, 'ppm')}  # fmt: skip
 """By the unit at the end of a parameter's name: the factor to the one that is shown, and that."""
@@ -61,10 +62,26 @@ def sizes(parameters: Mapping[str, Any], sigmas: Mapping[str, Any]) -> list[str]
     """Return a line for each parameter that fits one, with its standard deviation."""
     by_time = 'rms_s' in parameters
     return [
-        _line(key, value, sigmas.get(key), by_time)
-        for key, value in short_ones(dict(parameters))
-        if key not in UNSHOWN and value not in (None, [], {})
+        *(
+            _line(key, value, sigmas.get(key), by_time)
+            for key, value in short_ones(dict(parameters))
+            if key not in UNSHOWN and value not in (None, [], {})
+        ),
+        *_times(parameters.get('times_s', {}), parameters.get('recordings', {})),
     ]
+
+
+def _times(
+    times: Mapping[str, Sequence[float]], numbers: Mapping[str, Sequence[int]]
+) -> list[str]:
+    """A line for the times of each stream, with the numbers of recordings where there are many."""
+    return [
+        f'{name} at ' + ', '.join(
+            f'{time:.2f}' + (f' (recording {numbers[name][k]})' if numbers else '')
+            for k, time in enumerate(every)
+        ) + ' s'
+        for name, every in times.items() if every
+    ]  # fmt: skip
 
 
 def _line(key: str, value: Any, sigma: Any, by_time: bool) -> str:
@@ -112,6 +129,7 @@ def _number(value: float, sigma: float | None) -> str:
     return f'{value:.{min(max(decimals, 0), MOST_DECIMALS)}f}'
 
 
+FAR, WHEN = 'from the field generator, mm', ('before', 'after')
 SLICES, CELLS = 3, 8  # groups by distance or depth; cells of arrows along the longest side
 FEWEST, FEWEST_IN_CELL = 5, 2  # poses of which a group, and an arrow, is the mean
 ORDERS = {
@@ -132,13 +150,17 @@ def pose_verdict(document: dict[str, Any]) -> str:
     """State in one paragraph what was found and what stays unexplained."""
     held, rest = document['held_out'], document['unexplained']
     _, found = _parted(document)
-    before, after = 1e3 * held['position_rmse_before_m'], 1e3 * held['position_rmse_after_m']
+    before, after, outside = (
+        output.number(held[f'position_rmse_{key}_m'], 1e3, '.2f')
+        for key in ('before', 'after', 'outside_episodes')
+    )
     if found:
         names = ', '.join(dict.fromkeys(str(effect['name']) for effect in found))
-        text = f'Found: {names}. On held-out poses the error is '
-        text += f'{before:.2f} mm without and {after:.2f} mm with their correction.'
+        text = f'Found: {names}. On held-out poses the error is {before} mm'
+        text += f', and {after} mm corrected' if before != after else ''
+        text += f', {outside} mm outside the episodes.' if outside != after else '.'
     else:
-        text = f'No effect is found: with hand-eye alone the held-out error is {after:.2f} mm.'
+        text = f'No effect is found: with hand-eye alone the held-out error is {after} mm.'
     if not document['knows_levers']:
         text += ' The motion hardly determines where the sensors sit on the body, so that no '
         text += 'effect of place or of a single sensor can be told: turn the body about two axes.'
@@ -173,8 +195,24 @@ def render_poses(found: PoseDiagnosis, document: dict[str, Any], session: str) -
             'rest each, by a fit of the others). Before is with the lever arm and mount of each '
             'sensor, after with what was found as well.',
         ),
-        _by_sensor(document),
-        _by_distance(found.fit.state, before, after),
+        table(
+            [
+                'sensor',
+                'registration only, mm',
+                'with lever arm and mount, mm',
+                'with effects, mm',
+                'with mount, deg',
+                'with effects, deg',
+            ],
+            _by_sensor(document, ['registration_only', *WHEN], WHEN, '.2f'),
+        ),
+        _by_distance(before, after),
+        heading(
+            'Noise of each sensor, to compare with a data sheet',
+            'Root mean square of a coordinate, between neighbouring poses: what stays when '
+            'clocks, frames and maps are right, and what the reference adds.',
+        ),
+        _noise(document['noise']),
         heading(
             'Where space is bent',
             'Mean held-out errors in the plane of the field generator at three depths.',
@@ -214,20 +252,15 @@ def short_label(label: str) -> str:
     return text.replace(' ()', '')
 
 
-def _by_sensor(document: dict[str, Any]) -> Html:
-    places = [f'position_rmse_{key}_m' for key in ('registration_only', 'before', 'after')]
-    turns = [f'orientation_rmse_{key}_rad' for key in ('before', 'after')]
-    return table(
-        ['sensor', 'registration only, mm', 'with lever arm and mount, mm', 'with effects, mm',
-         'with mount, deg', 'with effects, deg'],
-        [
-            [
-                name, *(output.number(row[key], 1e3, '.2f') for key in places),
-                *(output.number(row[key], DEGREES, '.2f') for key in turns),
-            ]
-            for name, row in document['sensors'].items()
-        ],
-    )  # fmt: skip
+def _by_sensor(
+    document: dict[str, Any], places: Sequence[str], turns: Sequence[str], form: str
+) -> list[list[str]]:
+    columns = [(f'position_rmse_{key}_m', 1e3) for key in places]
+    columns += [(f'orientation_rmse_{key}_rad', DEGREES) for key in turns]
+    return [
+        [name, *(output.number(row[key], scale, form) for key, scale in columns)]
+        for name, row in document['sensors'].items()
+    ]
 
 
 def _effects(document: dict[str, Any]) -> Html:
@@ -269,34 +302,40 @@ def _triple(values: dict[str, Any], sigma: dict[str, Any], key: str, scale: floa
     """Three numbers with their sigmas; nothing where there are none."""
     if values.get(key) is None:
         return ''
-    return ', '.join(
-        '-' if value is None else f'{scale * value:.2f} ± {scale * spread:.2f}'
+    pairs = [
+        None if value is None else (scale * value, scale * spread)
         for value, spread in zip(values[key], sigma[key], strict=True)
+    ]
+    return ', '.join(
+        '-' if pair is None else f'{_number(*pair)} ± {_number(pair[1], pair[1])}'
+        for pair in pairs
     )
 
 
-def _by_distance(state: PoseState, before: PoseState, after: PoseState) -> Html:
-    """Held-out errors, and the noise of a coordinate of all poses, by distance and speed."""
+def _by_distance(before: PoseState, after: PoseState) -> Html:
+    """Held-out errors by distance."""
     rows = []
-    for parts in zip(before.parts, after.parts, state.parts, strict=True):
-        distances, whole = [_size(1e3 * part.view.measured) for part in parts], parts[-1]
-        speed = _size(whole.view.velocity[:, :3])
-        is_fast = speed > np.median(speed)
-        edges = np.quantile(distances[-1], np.linspace(0, 1, 1 + SLICES))
-        for low, high in pairwise(edges):
-            near = [
-                p.used & (low <= d) & (d <= high) for p, d in zip(parts, distances, strict=True)
-            ]
-            squares = [np.sum(p.residual[m, :3] ** 2, axis=1)
-                       for p, m in zip(parts[:2], near[:2], strict=True)]  # fmt: skip
-            squares += [jitter(whole, near[-1] & half, whole.noise.stamp_s > 0)[0]
-                        for half in (~is_fast, is_fast)]  # fmt: skip
+    for parts in zip(before.parts, after.parts, strict=True):
+        distance = _size(1e3 * parts[0].view.measured)
+        for low, high in pairwise(np.quantile(distance, np.linspace(0, 1, 1 + SLICES))):
+            near = (low <= distance) & (distance <= high)
+            squares = [np.sum(p.residual[p.used & near, :3] ** 2, axis=1) for p in parts]
             sizes = [np.sqrt(one.mean()) if one.size > FEWEST else None for one in squares]
-            rows.append([whole.view.sensor, f'{low:.0f} to {high:.0f}',
+            rows.append([parts[0].view.sensor, f'{low:.0f} to {high:.0f}',
                          *(output.number(size, 1e3, '.2f') for size in sizes)])  # fmt: skip
-    head = ['sensor', 'from the field generator, mm', 'error before, mm', 'error after, mm',
-            'noise of a coordinate, slow half, mm', 'fast half, mm']  # fmt: skip
-    return table(head, rows)
+    return table(['sensor', FAR, 'error before, mm', 'error after, mm'], rows)
+
+
+def _noise(noise: Sequence[Mapping[str, Any]]) -> Html:
+    speed = 1e3 * noise[0]['speed_m_s']
+    slow, fast = (f'{way} than {speed:.0f} mm/s, mm' for way in ('slower', 'faster'))
+    head = ['sensor', FAR, slow if speed else 'at rest, mm', fast, 'rotation, deg']
+    keys = (('slow_m', 1e3), ('fast_m', 1e3), ('turn_rad', DEGREES))
+    return table(head, [
+        [row['sensor'], f'{1e3 * row["from_m"]:.0f} to {1e3 * row["to_m"]:.0f}',
+         *(output.number(row[key], scale, '.3f') for key, scale in keys)]
+        for row in noise
+    ])  # fmt: skip
 
 
 def _arrows(before: PoseState, after: PoseState) -> Figure:
@@ -425,7 +464,8 @@ def evaluate(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     output.make_folder(args.out)
     first = found = diagnose_poses(session, tell, is_searched=False)
     if model:
-        found = diagnose_poses(corrected(session, model), tell, is_searched=False)
+        session = corrected(session, model)
+        found = diagnose_poses(session, tell, is_searched=False)
     states = first.states[0], found.states[0]
     found = replace(found, registered=first.registered, states=states)
     diagnosis = to_document(found)
@@ -465,18 +505,8 @@ def _session(
 
 def _by_sensor_text(diagnosis: dict[str, Any], head: Sequence[str]) -> Table:
     """Held-out errors of each sensor; a figure without a name in the head is left out."""
-    when = [key for key, name in zip(('before', 'after'), head, strict=False) if name]
-    rows = [
-        [
-            name,
-            *(
-                output.number(row[f'position_rmse_{key}_m'], 1e3)
-                for key in ('registration_only', *when)
-            ),
-            output.number(row['orientation_rmse_after_rad'], DEGREES),
-        ]
-        for name, row in diagnosis['sensors'].items()
-    ]
+    when = [key for key, name in zip(WHEN, head, strict=False) if name]
+    rows = _by_sensor(diagnosis, ['registration_only', *when], ['after'], '.3f')
     return output.terminal_table(['sensor', 'registered, mm', *filter(None, head)], rows)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -103,6 +104,7 @@ def _halves(errors: Array) -> Array:
     return np.asarray(np.sum(errors.reshape(-1, 2, 3) ** 2, axis=2))
 
 
+@lru_cache(maxsize=8)  # of the sensors of a session, for each effect that is observed
 def episode(sensing: Sensing, residuals: PoseResiduals) -> Episode:
     """Return when a sensor is off that was right at other times at the same places.
 
@@ -288,7 +290,8 @@ class LooseMount(PoseEffect):
         """Return the sensor whose shifts are its own; a single sensor's could be anything else."""
         if len(residuals.sensors) < 2:
             return []
-        shifts = {s.view.sensor: _shifts(s, residuals) for s in residuals.sensors}
+        passed = [w for s in residuals.sensors for w in episode(s, residuals).windows]
+        shifts = {s.view.sensor: _shifts(s, residuals, passed) for s in residuals.sensors}
         found = []
         for sensing in residuals.sensors:
             name = sensing.view.sensor
@@ -302,15 +305,20 @@ class LooseMount(PoseEffect):
         return found
 
 
-def _shifts(sensing: Sensing, residuals: PoseResiduals) -> tuple[float, float, float]:
-    """Share of squared error that windows' means in the body's frame explain; rms, m, rad."""
+def _shifts(
+    sensing: Sensing, residuals: PoseResiduals, passed: Sequence[int]
+) -> tuple[float, float, float]:
+    """Share of squared error that windows' means in the body's frame explain; rms, m, rad.
+
+    Without the windows that are ``passed``, in which something is near a sensor.
+    """
     window = windows_of(sensing, residuals)
     back = (sensing.view.frame @ sensing.view.turn).transpose(0, 2, 1)
     body = np.concatenate(
         [np.einsum('nij,nj->ni', back, sensing.residual[:, k : k + 3]) for k in (0, 3)], axis=1
     )
     explained, total, count, means = 0.0, 0.0, 0, []
-    for number in np.unique(window[window >= 0]):
+    for number in np.setdiff1d(window[window >= 0], passed):
         rows = body[(window == number) & sensing.used]
         if len(rows) < FEWEST_POSES_OF_WINDOW:
             continue

@@ -22,6 +22,7 @@ class FrameConvention(effect.PoseEffect):
 
     name = 'frame_convention'
     summary = 'the poses follow another convention than the stream states'
+    advice = 'They were read rightly; state it when exporting, or to import_poses.'
     role = effect.Role.READING
 
 
@@ -30,6 +31,7 @@ class SwappedSensors(effect.PoseEffect):
 
     name = 'swapped_sensors'
     summary = 'two sensors are exchanged'
+    advice = 'Their poses were put back; label the plugs.'
     role = effect.Role.SWAP
 
 

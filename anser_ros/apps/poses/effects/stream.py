@@ -1,6 +1,6 @@
 """What is wrong with a stream: repeated, missing or outlying poses, stamps of receipt, noise."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.optimize import minimize
@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from anser_ros.apps.poses.effect import PoseEffect
 from anser_ros.apps.poses.effects.episodes import in_episode
 from anser_ros.apps.poses.problem import PoseResiduals, Sensing, jitter, stamp_step
-from anser_ros.apps.poses.sequence import PoseSequence, PoseSession, jumping_poses
+from anser_ros.apps.poses.sequence import REFERENCE, PoseSequence, PoseSession, jumping_poses
 from anser_ros.arrays import Array, Booleans
 from anser_ros.diagnosis.decisions import FEWEST_OUTLIERS
 from anser_ros.field.model import EffectRecord
@@ -32,6 +32,9 @@ PAUSE_S, MANY_PAUSES = 2.0, 4
 """Pauses of this length, s, where there are so many, lie between recordings and are no gaps."""
 FEWEST_OUTLYING_POSES = 3  # outliers that must be there at least: one or two are an accident
 MOST_TIMES = 20  # times of outliers, or spans without poses, of a stream that are listed
+AT_ONCE = 0.6
+"""Share of the largest error of a run of poses by which it begins or ends if it does so at once:
+all of it, less noise; of a smooth error the part beyond what stands out, in some steps."""
 FAR = 14.0
 """Distance of the median outlier in spreads of a coordinate from which it is one: errors of real
 trackers have tails of half that."""
@@ -120,9 +123,9 @@ class PoseOutliers(PoseEffect):
 
     def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return one record of the outlying poses of all sensors."""
-        found = _leaping(residuals.session.reference)
-        # Those of an episode are off together.
-        outs = [s.out & ~in_episode(s, residuals) for s in residuals.sensors]
+        found = _leaping(residuals.session)
+        # Those of an episode are off together, and errors of places come gradually.
+        outs = [sudden_poses(s) & ~in_episode(s, residuals) for s in residuals.sensors]
         out = np.concatenate(outs)
         used = np.concatenate([s.used for s in residuals.sensors])
         count = int(np.count_nonzero(out))
@@ -146,23 +149,44 @@ class PoseOutliers(PoseEffect):
             'by_sensor': {
                 s.view.sensor: int(m.sum()) for s, m in zip(residuals.sensors, outs, strict=True)
             },
-            'times_s': {
-                s.view.sensor: [round(float(t), 3) for t in s.view.time[m][:MOST_TIMES]]
-                for s, m in zip(residuals.sensors, outs, strict=True)
-            },
+            **_when(
+                residuals.session,
+                {
+                    s.view.sensor: s.view.time[m]
+                    for s, m in zip(residuals.sensors, outs, strict=True)
+                },
+            ),
         }
         return [EffectRecord(self.name, values, {'fraction': float(np.sqrt(share / out.size))})]
 
 
-def _leaping(reference: PoseSequence | None) -> list[EffectRecord]:
+def sudden_poses(sensing: Sensing) -> Booleans:
+    """Return which poses (n,) stand out in runs of them that begin or end at once."""
+    rows = np.flatnonzero(sensing.used | sensing.out)
+    errors = sensing.noise.whitened(sensing.residual[rows], sensing.view.velocity[rows])
+    size, step = (np.linalg.norm(e, axis=1) for e in (errors, np.diff(errors, axis=0)))
+    out = sensing.out[rows]
+    run = np.cumsum(np.diff(out, prepend=False))
+    largest = np.zeros(run.max(initial=0) + 1)
+    np.maximum.at(largest, run, np.where(out, size, 0.0))
+    leaps = step > AT_ONCE * np.maximum(largest[run[1:]], largest[run[:-1]])
+    sudden = np.isin(run, run[out & (np.r_[leaps, False] | np.r_[False, leaps])])
+    return np.asarray(np.isin(np.arange(sensing.out.size), rows[out & sudden]))
+
+
+def _leaping(session: PoseSession) -> list[EffectRecord]:
     """A record of the reference's poses that leap."""
+    reference = session.reference
     if reference is None:
         return []
     away = jumping_poses(reference)
     share = float(away.mean()) if away.size else 0.0
     if share <= FEWEST_OUTLIERS or np.count_nonzero(away) < FEWEST_OUTLYING_POSES:
         return []
-    values = {'fraction': share, 'stream': reference.name}
+    values = {
+        'fraction': share, 'stream': reference.name,
+        **_when(session, {REFERENCE: reference.time[away]}),
+    }  # fmt: skip
     sigma = float(np.sqrt(share / away.size))
     return [EffectRecord(PoseOutliers.name, values, {'fraction': sigma})]
 
@@ -178,6 +202,22 @@ def _moving(poses: PoseSequence) -> Booleans:
     return np.asarray(near & (way > 2 * NEAR * MOVING_M))
 
 
+def _when(session: PoseSession, times: Mapping[str, Array]) -> dict[str, object]:
+    """The first times, s, of each stream's poses, and of several recordings the number of each."""
+    first = {
+        name: [round(float(t), 3) for t in every[:MOST_TIMES]] for name, every in times.items()
+    }
+    ends = _ends(session)
+    numbers = {name: (1 + np.searchsorted(ends, t)).tolist() for name, t in first.items()}
+    return {'times_s': first, **({'recordings': numbers} if ends.size else {})}
+
+
+def _ends(session: PoseSession) -> Array:
+    """Times, s, after which all streams pause, as between the recordings of two files."""
+    every = np.sort(np.concatenate([np.r_[p.time, p.missing] for p in session.streams.values()]))
+    return np.asarray(every[:-1][np.diff(every) > PAUSE_S])
+
+
 def _gaps(poses: PoseSequence, session: PoseSession) -> list[tuple[float, float]]:
     """Spans, s, without poses; none in which all streams pause, as between two recordings."""
     steps = np.diff(poses.time)
@@ -188,8 +228,7 @@ def _gaps(poses: PoseSequence, session: PoseSession) -> list[tuple[float, float]
     pauses = gaps[steps[gaps] > PAUSE_S]
     if pauses.size >= MANY_PAUSES:
         gaps = np.setdiff1d(gaps, pauses)
-    every = np.sort(np.concatenate([np.r_[p.time, p.missing] for p in session.streams.values()]))
-    ends = every[np.flatnonzero(np.diff(every) > PAUSE_S)]
+    ends = _ends(session)
     spans = [(float(poses.time[g]), float(poses.time[g + 1])) for g in gaps]
     return [(a, b) for a, b in spans if not np.any((ends >= a) & (ends < b))]
 
