@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from anser_ros.apps.poses.importing import ORDERS, STAMPS, import_poses, write_pose_session
+from anser_ros.apps.poses.forms import ORDERS
+from anser_ros.apps.poses.importing import STAMPS, import_poses, write_pose_session
 from anser_ros.cli.output import Result, Tell, add_json, add_list, check_new_file
 from anser_ros.errors import ParameterError
 from anser_ros.wire.setup_values import read_name
