@@ -210,7 +210,7 @@ def check_typed(typed: Measurements, drawn: Measurements, nominal: FieldModel | 
     length = np.repeat(typed.sensors.length[:1], len(places))
     made, read = nominal.flux(places, typed.placed()[1][:, 0], length), typed.flux[:, 0]
     gain = float(np.vdot(made, read).real / np.vdot(made, made).real)
-    size = np.linalg.norm(read - gain * made) / np.linalg.norm(made)
+    size = float(np.linalg.norm(read - gain * made) / np.linalg.norm(made))
     if abs(gain - 1.0) > max(OTHER_GAIN, 4.0 * size):
         raise FitError(
             f'{typed.body}: the readings are {gain:.2f} times what the drawn board gives at the '
