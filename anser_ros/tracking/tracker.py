@@ -300,8 +300,8 @@ class Tracker:
         frames, bodies = [], []
         for name, (rows, table) in self._scene.bodies.items():
             single = [coils[i] for i in rows]
-            flux = values[rows]
-            frame = BodyFrame(name, stamp_ns, flux, context, self.settings, table, single)
+            own = values[rows]
+            frame = BodyFrame(name, stamp_ns, own, context, self.settings, table, single)
             frames.append(frame)
             if context.symmetry is not None:
                 reason = 'the field is the same all around its axis: a turn about it stays unknown'

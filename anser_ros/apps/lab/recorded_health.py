@@ -69,7 +69,8 @@ def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
 
     A bag without diagnostics, or one that cannot be read yet, gives an empty mapping.
     """
-    decoder, words = MessageDecoder(), {}
+    decoder = MessageDecoder()
+    words: dict[str, Mapping[str, str]] = {}
     try:
         for raw in iter_messages(path, Salvage()):
             if raw.topic == TOPIC:
