@@ -32,6 +32,7 @@ DIALECTS = {
     'tab': text_of('\t'),
     'tab and decimal comma': text_of('\t', comma=True),
     'blanks': text_of(' '),
+    'blanks in columns': text_of('   '),
     'blanks and decimal comma': text_of('  ', comma=True),
     'a blank behind the comma': text_of(', '),
     'quotes': text_of('","').replace('\n', '"\n"')[:-1].join(['"', '']),
@@ -129,6 +130,9 @@ ANGLES = ['roll', 'pitch', 'yaw']
 MATRIX = [(*np.eye(4)[:3].ravel(),)] * 9
 REFUSED = {
     'angles': (text_of(',', [*NAMES[:4], *ANGLES, 'rms']), 'rms: angles are not read, give'),
+    'a rotation vector': (
+        text_of(',', [*NAMES[:4], 'rx_deg', 'ry_deg', 'rz_deg', 'n']), 'rx_deg, ry_deg, rz_deg'
+    ),
     'q0 to q3': (text_of(',', [*NAMES[:4], 'q0', 'q1', 'q2', 'q3']), 'q0, q1, q2, q3 are no'),
     'letters': (text_of(',', list('abcdefgh')), 'no position x, y, z'),
     'a counter': (text_of(',', ['frame', *NAMES[1:]]), 'no time'),
@@ -152,12 +156,16 @@ REFUSED = {
     ),
     'a matrix': (rows_of('', *MATRIX, separator=' '), '12 numbers a line'),
     'seven numbers': (rows_of('', *(r[1:] for r in ROWS), separator=' '), '7 numbers a line'),
+    'nine numbers': (rows_of('', *((*r, 1) for r in ROWS), separator=' '), '9 numbers a line'),
     'a station number': (
         rows_of('', *((1, *r[1:]) for r in ROWS), separator=' '), 'all 12 times are 1 s'
     ),
     'times that fall': (
         rows_of('', *((9 - k % 3, *r[1:]) for k, r in enumerate(ROWS)), separator=' '),
         'the times do not ascend',
+    ),
+    'stamps that are never set': (
+        rows_of('time,x,y,z,qx,qy,qz,qw', *((0, *r[1:]) for r in ROWS)), 'all 12 times are 0 s'
     ),
     'the time of the day': (
         rows_of('time,x,y,z,qx,qy,qz,qw', *((f'08:53:{k}', *r[1:]) for k, r in enumerate(ROWS))),
@@ -172,6 +180,10 @@ REFUSED = {
     '1904': (
         rows_of('t,x,y,z,qx,qy,qz,qw', *((3842844800.5 + r[1], *r[1:]) for r in ROWS)),
         'since 1904 (LabVIEW)? start_ns: -2082844800000000000',
+    ),
+    '1900': (
+        rows_of('t,x,y,z,qx,qy,qz,qw', *((3968988800.5 + r[1], *r[1:]) for r in ROWS)),
+        'since 1900 (NTP)? start_ns: -2208988800000000000',
     ),
     'half of the quaternions zero': (
         text_of(',', rows=[r if k % 2 else (*r[:4], 0, 0, 0, 0) for k, r in enumerate(ROWS)]),
@@ -192,6 +204,7 @@ REFUSED = {
         'RX, RY, RZ are no quaternion',
     ),
     'no text': ('\0\1\2\3' * 40, 'not a text'),
+    'words': ('some words\nand more\n', 'no row of numbers'),
 }  # fmt: skip
 
 
