@@ -94,7 +94,6 @@ SERIAL = (
     _line('swap-clusters', 'columns of two clusters are swapped', lambda r, g: t.swapped(0, 7)),
     _line('swap-tool-reference', 'a tool and a reference column are swapped',
           lambda r, g: t.swapped(4, 12)),
-    _line('gain-all', 'a gain of 2 % on all coils', lambda r, g: t.gain(1.02, t.TOOL)),
     _line('gain-one', 'a gain of 5 % on one coil', lambda r, g: t.gain(1.05, [4])),
     _line('gain-cluster', 'a gain of 5 % on one cluster', lambda r, g: t.gain(1.05, [3, 4, 5])),
     _line('gain-current', 'a gain of 2 % on the current', lambda r, g: t.gain(1.02, [-1])),
@@ -158,7 +157,7 @@ CLOCK = (
 TOGETHER = (
     *(_line(f'tool-gain-{g:g}', f'a gain of {g:g} % on all coils, 10 s',
             lambda r, rng, g=g: t.gain(1.0 + g / 100.0, t.TOOL), lasts_s=10.0)
-      for g in (1.0, 1.5)),
+      for g in (1.0, 1.5, 2.0)),
     *(_line(f'tool-drift-{g:g}', f'the gain of all coils drifts by {g:g} % in 15 s',
             lambda r, rng, g=g: t.drifting(g / 1500.0, t.TOOL, r.rate_hz), lasts_s=15.0)
       for g in (1.0, 1.5, 2.0)),
