@@ -234,6 +234,11 @@ def lost(share: float, rng: np.random.Generator) -> Tamper:
     return each(lambda _record: [], share, rng)
 
 
+def doubled(share: float, rng: np.random.Generator) -> Tamper:
+    """Let a share of the records arrive twice."""
+    return each(lambda record: [record, record], share, rng)
+
+
 def replayed(seconds: float) -> Tamper:
     """Let all records of the first seconds arrive again and again in place of the live ones."""
     kept: list[bytes] = []
@@ -317,6 +322,13 @@ def hello_scaled(**factors: float) -> Tamper:
         hello=lambda given: replace(
             given, **{k: getattr(given, k) * f for k, f in factors.items()}
         )
+    )
+
+
+def scaled_channels(factor: float) -> Callable[[Hello], Hello]:
+    """Return what multiplies the full scale of all channels."""
+    return lambda given: replace(
+        given, channels=tuple(replace(c, full_scale=factor * c.full_scale) for c in given.channels)
     )
 
 

@@ -532,3 +532,17 @@ def test_metal_at_a_place_is_named_at_every_visit_and_neither_as_noise_nor_as_a_
     assert {r.name for r in records} == {'moving_metal'}
     found = [(r.parameters['t_start_s'] + r.parameters['t_end_s']) / 2 - 1 for r in records]
     np.testing.assert_allclose(found, middles, atol=1)
+
+
+def test_a_scale_of_all_sensors_is_named_as_such_beside_a_bend():
+    world = World(1, duration=30.0, sensors=3, rate=20.0)
+    world.scale = 1.012
+
+    def bend(sensor, place):
+        x, y, z = ((place - MIDDLE) / 0.08).T
+        return place + 8e-4 * np.stack([x * y, z**2 - 0.5, x * z], axis=1)
+
+    world.bend = bend
+    found = named(diagnose_poses(world.session()))
+    assert found['optical_scale'].parameters['scale'] == pytest.approx(1.012, abs=2e-3)
+    assert set(found) <= {'optical_scale', 'field_distortion'}
