@@ -192,13 +192,17 @@ def _check_flux(
         )
 
 
-def check_unit(path: str, model: FieldModel, tool: Measurements) -> None:
-    """Raise `PlausibilityError` where a tool reads many times what a model has at its poses."""
+def check_unit(path: str, model: FieldModel, tool: Measurements, noise_t: float) -> None:
+    """Raise `PlausibilityError` where a tool reads many times what a model has at its poses.
+
+    Poses where it has no more than the noise, T, are far away, and tell nothing of a unit.
+    """
     rows, columns = _chosen(tool)
     made = model.flux(*(part[rows, columns] for part in tool.placed()))
-    if len(rows) >= FEWEST_READINGS:
-        size, expected = (np.linalg.norm(f, axis=1) for f in (tool.flux[rows, columns], made))
-        _check_flux(path, tool, size, expected, 'the model makes at its poses')
+    size, expected = (np.linalg.norm(f, axis=1) for f in (tool.flux[rows, columns], made))
+    near = expected > noise_t
+    if np.count_nonzero(near) >= FEWEST_READINGS:
+        _check_flux(path, tool, size[near], expected[near], 'the model makes at its poses')
 
 
 def _check_size(path: str, setup: Setup, drawn: FieldFunction, tool: Measurements) -> None:

@@ -89,7 +89,7 @@ def prepare(
     """
     check_fits(model, session)
     for tool in session.tools:
-        check_unit(session.path, model, tool)
+        check_unit(session.path, model, tool, session.setup.accuracy.flux_noise_t)
     model = as_it_stood(model, session)
     clean = None
     if baseline is not None:

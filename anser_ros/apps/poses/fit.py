@@ -44,6 +44,9 @@ CHANCE = 0.01
 FILTER_STEPS = 3  # Newton's, to a time constant that is known to some percent
 NEAR_TAU = 1.25
 """Factor by which positions alone may move a time constant; without a filter it leads anywhere."""
+FARTHEST_LOG = 100.0
+"""Logarithm of a spread, either way, at which a search for the likeliest one stops: no number of
+this size has an overflow."""
 LARGEST_STAMP_S = 0.1
 """Spread of stamps, s, beyond which a time makes no pose of a hand's motion."""
 
@@ -250,6 +253,7 @@ def noise_of(part: PosePart, with_stamps: bool = True) -> tuple[PoseNoise, float
 
     def cost(log: Array) -> float:
         """Sum of the whitened squares (`PoseNoise.whitened`) and of the spreads' logarithms."""
+        log = np.clip(log, -FARTHEST_LOG, FARTHEST_LOG)
         place, turn = np.exp(-2 * log[0]), np.exp(-2 * log[1])
         fixed = own[0] * place + own[1] * turn + 6 * log[0] + 6 * log[1]
         if not with_stamps:
