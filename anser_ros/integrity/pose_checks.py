@@ -36,6 +36,9 @@ START_FRAMES = 3
 ALTERNATES_S, FEWEST_JUMPS = 2.0, 3
 """So many jumps within this time, s, to another pose that fits as well, and back, are no motion
 and no chance (once is a damaged record): two worlds take turns, as where a block is late."""
+ENDED_S = 0.8
+"""Time, s, after the last jump from which on they have ended: such jumps are hardly further apart,
+and poses are to be back within a second."""
 DETOUR = 3.0
 """Length of a way by that of the straight one from which on what is between is a jump."""
 LONGEST_RUN_S = 0.25
@@ -109,9 +112,10 @@ class Continuity:
     @property
     def alternates(self) -> str:
         """Return that two worlds take turns; empty where they do not."""
-        if len(self._jumps) < FEWEST_JUMPS:
+        jumps = self._jumps
+        if len(jumps) < FEWEST_JUMPS or self._last_ns - jumps[-1] > ENDED_S / NANO:
             return ''
-        times = f'{len(self._jumps)} times within {ALTERNATES_S:g} s'
+        times = f'{len(jumps)} times within {ALTERNATES_S:g} s'
         return f'the readings jump to another pose and back, {times}: a fault of the line'
 
     def forget(self) -> None:
