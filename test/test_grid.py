@@ -65,6 +65,8 @@ def test_plates_have_their_known_places():
     assert places_of('duplo')[0].round(5).tolist() == [-0.09525, -0.09525, 0.1206]
     with pytest.raises(ParameterError, match='7x7'):
         places_of('gremlin')
+    with pytest.raises(ParameterError, match='between 1 and 1000 mm'):
+        places_of('7x7', 0.0)
 
 
 def test_rests_are_taken_and_what_is_wrong_is_said_at_once(tmp_path):
@@ -133,3 +135,8 @@ def test_over_the_graph_with_a_bad_point_and_undo(start, ros, tmp_path):
     assert load_session(out).tools[0].position[:, 0].round(5).tolist() == [-0.04286, 0, 0.04286]
     again = start('grid', '--out', out)
     assert again.popen.wait(60) == 2 and 'already exists' in again.log.read_text()
+    plate = tmp_path / 'three.csv'
+    for name, words in (('three.mcap', 'three.csv: already exists'), ('q.csv', 'end in .mcap')):
+        wrong = start('grid', '--plate', plate, '--out', tmp_path / name)
+        assert wrong.popen.wait(60) == 2 and words in wrong.log.read_text()
+    assert plate.read_text() == '\n'.join(rows)

@@ -42,24 +42,33 @@ class GridGuide(AnserNode):
         words = f'{", ".join(PLATES)}, or a table with x_mm, y_mm, z_mm (%(default)s)'
         parser.add_argument('--plate', default='7x7', help=words)
         words = "distance of neighbouring places, mm; by default the plate's own"
-        parser.add_argument('--pitch-mm', type=float, default=0.0, help=words)
-        words = "height of the coil's middle over the board, mm; several for several planes"
+        parser.add_argument('--pitch-mm', type=float, help=words)
+        own = ', '.join(f'{1e3 * one[2]:g} ({name})' for name, one in PLATES.items())
+        words = f"height of the coil's middle over the board, mm, once a plane; by default {own}"
         parser.add_argument('--height-mm', type=float, action='append', default=[], help=words)
         parser.add_argument('--body', default='', help='the probe, where the setup has several')
 
     def __init__(
-        self, out: Path, plate: str, pitch_mm: float, height_mm: list[float], body: str,
+        self, out: Path, plate: str, pitch_mm: float | None, height_mm: list[float], body: str,
         **options: Any,
     ) -> None:  # fmt: skip
         self._out, self._body, self._said = out, body, ''
         self._guide: PlateGuide | None = None
-        self._places = places_of(plate, 1e-3 * pitch_mm, [1e-3 * one for one in height_mm])
-        if out.exists() or not out.absolute().parent.is_dir():
-            reason = 'already exists' if out.exists() else 'there is no such folder'
-            raise ParameterError(f'{out}: {reason}')
-        super().__init__(**options)
+        pitch = None if pitch_mm is None else 1e-3 * pitch_mm
+        self._places = places_of(plate, pitch, [1e-3 * one for one in height_mm])
         rows = [','.join(f'{1e3 * value:.3f}' for value in place) for place in self._places]
-        out.with_suffix('.csv').write_text('\n'.join(['x_mm,y_mm,z_mm', *rows, '']), 'utf-8')
+        words, listed = '\n'.join(['x_mm,y_mm,z_mm', *rows, '']), out.with_suffix('.csv')
+        if out.suffix != '.mcap':
+            raise ParameterError(f'{out}: --out must end in .mcap')
+        if not out.absolute().parent.is_dir():
+            raise ParameterError(f'{out}: there is no such folder')
+        if out.exists():
+            raise ParameterError(f'{out}: already exists')
+        if listed.exists() and listed.read_bytes() != words.encode():
+            reason = 'already exists, and is no list of these places'
+            raise ParameterError(f'{listed}: {reason}; give --out another name')
+        super().__init__(**options)
+        listed.write_text(words, 'utf-8')
         for name in ACTIONS:
             self.create_service(Trigger, f'grid/{name}', partial(self._on_ask, name))
         self._setup_source = setup_source(self, self._on_setup)

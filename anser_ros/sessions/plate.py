@@ -49,7 +49,7 @@ AROUND = 4
 """Places around that are looked at."""
 
 
-def places_of(name: str, pitch_m: float = 0.0, heights_m: Sequence[float] = ()) -> Array:
+def places_of(name: str, pitch_m: float | None = None, heights_m: Sequence[float] = ()) -> Array:
     """Return the places (P, 3) of a plate, m, frame fg, row by row with x ascending.
 
     ``name`` is of `PLATES`, or the path of a table with x_m, y_m and z_m (or _mm). Pitch and
@@ -61,7 +61,7 @@ def places_of(name: str, pitch_m: float = 0.0, heights_m: Sequence[float] = ()) 
             raise ParameterError(f'no plate {name!r}: there are {", ".join(PLATES)}, or a table')
         return read_table(name).positions()
     side, pitch, height = PLATES[name]
-    step, heights = pitch_m or pitch, heights_m or [height]
+    step, heights = pitch if pitch_m is None else pitch_m, heights_m or [height]
     if not all(1e-3 <= one < 1.0 for one in (step, *heights)):
         raise ParameterError('pitch and heights must be between 1 and 1000 mm')
     line = step * (np.arange(side) - (side - 1) / 2.0)
