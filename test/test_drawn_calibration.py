@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.result import to_document
 from anser_ros.calibration.sensor_parameters import KINDS
+from anser_ros.cli.evaluate import why_withheld
 from anser_ros.cli.main import main
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
@@ -211,7 +212,11 @@ def test_a_board_of_few_emitters_calibrates_by_whole_tools(setup, emitters, seed
     coils = tuple(setup.emitter.coils[k] for k in emitters)
     world = World(replace(setup, emitter=replace(setup.emitter, coils=coils)), seed)
     session = world.waved(12.0)
-    tracked = track_session(session, calibrated(session).model)
+    model = calibrated(session).model
+    tracked = track_session(session, model)
+    words = ' '.join(why_withheld(model, tracked))
+    few = r'^most poses are withheld, state ambiguous in (\d+) of \1 \(3 readings are too few'
+    assert bool(words) == (len(emitters) < 5) == bool(re.search(few, words)), words
     series = tracked.bodies['tool']
     assert series.ok.mean() > 0.95
     position, _ = hand(session.tools[0].time / 10.0)

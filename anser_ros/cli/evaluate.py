@@ -2,6 +2,7 @@
 
 import argparse
 import math
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from anser_ros.cli.commands import SESSION_KINDS
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
-from anser_ros.pose_states import RESIDUAL
+from anser_ros.pose_states import OK, RESIDUAL
 from anser_ros.sessions.follower import parse_references, with_references
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import model_for
@@ -36,6 +37,8 @@ MOST_POINTS = 4000
 """Most points that a figure shows of one coil: more cannot be distinguished."""
 COVERAGE_SIGMAS = np.linspace(0.0, 4.0, 81)
 """Multiples of sigma for which the share of errors within is drawn, to where all should be."""
+HARDLY = 0.05
+"""Share of the poses up to which it is said why there are hardly any."""
 ERRORS_HEAD = ('sensor', 'frames', 'tracked', 'RMSE mm', 'PRC95 mm', 'RMSE deg', 'PRC95 deg')
 """Head of the table of `error_rows`."""
 
@@ -293,6 +296,8 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         progress=lambda share: tell('tracking', share),
     )  # fmt: skip
     document = {**to_document(evaluation), 'recording': recording_of(session)}
+    if why := why_withheld(model, evaluation):
+        document['withheld'] = why[0]
     written = list(output.write_files(args.out, {'evaluation.json': document}))
     written += write_tables(args.out, evaluation)
     written += write_figures(
@@ -305,9 +310,8 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     notes = (
         *sessions.snapshot_notes(args.model, model),
         *output.loss_notes(session, baseline),
-        *(_few_notes(session) if args.refit else ()),
-        *_other_coils(model, evaluation),
-    )  # fmt: skip
+        *((_few_notes(session) if args.refit else ()) or why),
+    )
     return output.Result(document, notes, tuple(shown), tuple(written))
 
 
@@ -323,17 +327,29 @@ def _few_notes(session: Session) -> tuple[str, ...]:
     )
 
 
-def _other_coils(model: FieldModel, evaluation: Evaluation) -> tuple[str, ...]:
-    """State what to do where most coils misfit a model that knows some of them."""
-    known = sorted({c for effect in model.effects for c in effect.parameters.get('channels', ())})
-    states = [pose.state for coil in evaluation.sensors.values() for pose in coil.estimates]
-    if not known or 2 * states.count(RESIDUAL) <= len(states):
+def why_withheld(model: FieldModel, evaluation: Evaluation) -> tuple[str, ...]:
+    """State why hardly a coil has a pose, or most misfit a model that knows some of them."""
+    parameters = [effect.parameters for effect in model.effects]
+    known = sorted({c for one in parameters for c in one.get('channels', [one.get('channel')])})
+    known = [channel for channel in known if channel is not None]
+    poses = [pose for coil in evaluation.sensors.values() for pose in coil.estimates]
+    found = Counter(pose.state for pose in poses)
+    worst, count = max(found.items(), key=lambda one: (one[0] != OK, one[1]), default=(OK, 0))
+    if found[OK] > HARDLY * len(poses) and (worst != RESIDUAL or not known):
         return ()
+    if worst == OK or 2 * count <= len(poses):
+        return ()
+    reasons = [pose.reason for pose in poses if pose.state == worst and pose.reason]
+    such = f' ({reasons[len(reasons) // 2]})' if reasons else ''
+    listed = f'the coils of its calibration (channels {", ".join(map(str, known))})'
+    why = (
+        f': the model knows {listed if known else "no coil by itself"}; another one is off in '
+        'gain and axis, by 2 % and 1 deg as wound by hand, and so is an emitter that warmed up: '
+        'calibrate with what is tracked, when the board is warm, and look for metal'
+    )
     return (
-        f'most poses are withheld, state {RESIDUAL}: the model knows the coils of its calibration '
-        f'(channels {", ".join(map(str, known))}); another one is off in gain and axis, by 2 % '
-        'and 1 deg as wound by hand, and so is an emitter that warmed up: calibrate with what is '
-        'tracked, when the board is warm',
+        f'most poses are withheld, state {worst} in {count} of {len(poses)}{such}'
+        f'{why if worst == RESIDUAL else ""}',
     )
 
 
