@@ -184,6 +184,9 @@ def test_a_pitch_or_a_place_that_is_a_little_wrong_is_said(setup, change, said):
     some = calibrated(replace(session, tools=(tool.frames(np.arange(49) != 30),)))
     assert not some.contradictions
     assert '1 of the 49 places of the lattice have no reading' in ' '.join(some.undetermined)
+    beside = tool.position + 2e-3 * np.eye(49)[24][:, None] * [1, 0, 0]
+    beside = calibrated(replace(session, tools=(replace(tool, position=beside),)))
+    assert 'of the lattice' not in ' '.join(beside.undetermined)
     with pytest.raises(FitError, match='the drawn board, which such readings suffice for'):
         calibrate_sessions([session], Options(estimate=()))
     wrong = replace(session, tools=(replace(tool, position=change(tool.position)),))
@@ -274,6 +277,17 @@ def test_what_was_typed_wrongly_is_named_with_its_size(setup):
             calibrated(wrongly(session, **wrong))
     with pytest.raises(FitError, match=r'are 1\.2\d times what the drawn board gives'):
         calibrated(wrongly(session, flux=1.22 * tool.flux))
+    coils = np.arange(8)
+    for words, flux in {
+        r'coil0 and coil1 alone .* exchanged\?': tool.flux[:, :, np.r_[1, 0, 2:8]],
+        r'coil3 alone .* in reverse\?': tool.flux * np.where(coils == 3, -1.0, 1.0),
+        r'coil3 alone .* dead\?': tool.flux * np.where(coils == 3, 1e-6, 1.0),
+        'emitter 3, counted from 0. Is it dead': tool.flux * np.where(coils == 3, np.nan, 1.0),
+        'are 90 deg off in phase': 1j * tool.flux,
+    }.items():
+        valid = np.isfinite(flux).all(axis=2)
+        with pytest.raises(FitError, match=words):
+            calibrated(wrongly(session, flux=flux, valid=valid))
     rest = tool.frames(np.delete(np.arange(49), 16))
     same = {key: getattr(tool, key)[:48] for key in ('time', 'position', 'rotation')}
     with pytest.raises(FitError, match=r'one of the typed places 1\d to 1\d was missed'):
@@ -289,6 +303,7 @@ def test_what_was_typed_wrongly_is_named_with_its_size(setup):
         r'plate is turned by (89|9\d) deg, and -?\d, -?\d, -?\d mm away': quarter,
         r'plate is turned by -?\d deg, and 2\d, -?\d, -?\d mm away': tool.position - [0.025, 0, 0],
         r'typed 84 mm below the board and lies 8\d mm above': tool.position * [1, 1, -1],
+        r'typed 0 mm over the board .* the height missing': tool.position * [1, 1, 0],
         r'another order: reading \d+ was taken at place \d+; .* up to \d+ mm': shuffled,
     }
     for words, position in wrongs.items():

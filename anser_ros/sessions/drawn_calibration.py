@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from anser_ros.arrays import Array
+from anser_ros.arrays import Array, ComplexArray
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.drawn_fit import PLACE, PLATE, SCALE, DrawnFit, DrawnFitter, evenly
 from anser_ros.calibration.held_out import HeldOutTally
@@ -48,6 +48,7 @@ from anser_ros.pose_states import INCONSISTENT, OK
 from anser_ros.sessions.nominal_board import NominalBoard
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import track_session
+from anser_ros.tracking.coil_step import UNKNOWNS
 from anser_ros.tracking.estimate import NO_GATE, TrackerSettings
 
 MOST_NOISE = 5.0
@@ -68,6 +69,11 @@ MOST_GAPS = 3
 on the lattice of all their coordinates."""
 IN_A_LINE = 0.01
 """Ratio of a plate's square widths below which its places lie in a line, which tells no mirror."""
+NO_HEIGHT_M = 0.01
+"""Height of a typed plate, m, below which it is doubted: a coil and its holder are no flatter."""
+ALIKE, OTHER_PHASE = 0.9, 20.0
+"""Correlation of an emitter's readings with the drawn ones at places that are right, where another
+emitter's is far below, and a phase that all share, deg, that is doubted: filters leave a few."""
 CLEAR = 2.0
 """Standard deviations from which on an emitter is said to be elsewhere than drawn."""
 
@@ -118,7 +124,7 @@ def fit_to_drawing(
     if fewest < FEWEST_SCAN_FRAMES:
         raise FitError(
             f'a calibration needs at least {FEWEST_SCAN_FRAMES} frames whose coils the drawn '
-            f'board places, got {fewest}'
+            f'board places, got {fewest}{_few_words(generator)}'
         )
     noise_t = options.accuracy.flux_noise_t
     fit = DrawnFitter(found, typed, generator, options.estimate, noise_t).fit(progress)
@@ -131,6 +137,13 @@ def fit_to_drawing(
         )
     names = [Path(session.path).name for session in sessions for _ in session.tools]
     return with_provenance(_calibration(fit, found, typed, generator, options), names)
+
+
+def _few_words(generator: Generator) -> str:
+    """What few emitters leave open, in words; nothing where they place a coil."""
+    count = len(generator.emitters)
+    few = f'; {count} emitters cannot place a coil by itself, whose pose has {UNKNOWNS} unknowns'
+    return few if count < UNKNOWNS else ''
 
 
 def _check_channels(tools: Sequence[Measurements]) -> None:
@@ -154,7 +167,10 @@ def _drawn_poses(session: Session, nominal: FieldModel | None) -> list[Measureme
     """
     assert nominal is not None
     settings = TrackerSettings(gate=NO_GATE, max_sigma_m=1.0)
-    tracked, out = track_session(session, nominal, settings), list[Measurements]()
+    # Typed poses of any unit take no part.
+    bare = (replace(tool, has_pose=np.zeros_like(tool.has_pose)) for tool in session.tools)
+    tracked = track_session(replace(session, tools=tuple(bare)), nominal, settings)
+    out = list[Measurements]()
     for tool in session.tools:
         series = [tracked.sensors[name].estimates for name in tool.sensors.name]
         # Coils that are a little off contradict their body, which is no fault of their places.
@@ -197,6 +213,11 @@ def check_typed(typed: Measurements, drawn: Measurements, nominal: FieldModel | 
     found = drawn.frames(np.isin(drawn.time, typed.time))
     known = found.has_pose
     places, there = (of_all.placed()[0][:, 0] for of_all in (typed, found))
+    assert nominal is not None
+    length = np.repeat(typed.sensors.length[:1], len(places))
+    made, read = nominal.flux(places, typed.placed()[1][:, 0], length), typed.flux[:, 0]
+    if words := _wiring_words(made, read, nominal.emitters):
+        raise FitError(f'{typed.body}: {words}')
     if known.sum() < FEWEST_SCAN_FRAMES:
         return ''
     alike = np.einsum('fsi,fsi->fs', typed.placed()[1], found.placed()[1])[known]
@@ -206,9 +227,14 @@ def check_typed(typed: Measurements, drawn: Measurements, nominal: FieldModel | 
             f'{DEGREES * np.arccos(np.clip(np.median(alike), -1.0, 1.0)):.0f} deg: is its axis '
             'reversed, or the probe upside down?'
         )
-    assert nominal is not None
-    length = np.repeat(typed.sensors.length[:1], len(places))
-    made, read = nominal.flux(places, typed.placed()[1][:, 0], length), typed.flux[:, 0]
+    middle, centre = places[known].mean(axis=0), there[known].mean(axis=0)
+    if middle[2] < NO_HEIGHT_M and centre[2] - middle[2] > NEAR_M:
+        side = 'below' if middle[2] < 0.0 else 'over'
+        why = 'z reversed, or the plate upside down' if middle[2] < 0.0 else 'the height missing'
+        raise FitError(
+            f'{typed.body}: the plate is typed {1e3 * abs(middle[2]):.0f} mm {side} the board and '
+            f'lies {1e3 * centre[2]:.0f} mm above it: is {why}?'
+        )
     gain = float(np.vdot(made, read).real / np.vdot(made, made).real)
     size = float(np.linalg.norm(read - gain * made) / np.linalg.norm(made))
     if abs(gain - 1.0) > max(OTHER_GAIN, 4.0 * size):
@@ -225,12 +251,13 @@ def check_typed(typed: Measurements, drawn: Measurements, nominal: FieldModel | 
     wrong = np.concatenate([[0], np.cumsum(off[:-1] > NEAR_M)])
     wrong[:-1] += np.cumsum(later[::-1])[::-1]
     missed, last = np.flatnonzero(wrong == wrong.min())[[0, -1]].tolist()
+    one = f'one of the typed places {missed + 1} to {last + 1}'
+    one = one if last > missed else f'the typed place {missed + 1}'
     if wrong[missed] <= MOST_ASTRAY * known.sum() and missed < len(places) - 1:
         raise FitError(
-            f'{typed.body}: one of the typed places {missed + 1} to {last + 1} was missed: from '
+            f'{typed.body}: {one} was missed: from '
             f'there on each reading belongs to the next place, {1e3 * pitch:.0f} mm or more off'
         )
-    middle, centre = places[known].mean(axis=0), there[known].mean(axis=0)
     arms, ways = places[known] - middle, there[known] - centre
     one, sizes, other = np.linalg.svd(ways[:, :2].T @ arms[:, :2])
     turn = np.eye(3)
@@ -241,11 +268,6 @@ def check_typed(typed: Measurements, drawn: Measurements, nominal: FieldModel | 
         f'{1e3 * np.median(off[known]):.0f} mm (median), up to {1e3 * off[known].max():.0f} mm, '
         'from where it was typed'
     )
-    if middle[2] < 0.0 < centre[2]:
-        raise FitError(
-            f'{typed.body}: the plate is typed {-1e3 * middle[2]:.0f} mm below the board and lies '
-            f'{1e3 * centre[2]:.0f} mm above it: is z reversed, or the plate upside down?'
-        )
     if np.mean(rest > NEAR_M) <= MOST_ASTRAY and sizes[1] > IN_A_LINE * sizes[0]:
         if abs(scale - 1.0) > OTHER_PITCH:
             raise FitError(
@@ -268,6 +290,28 @@ def check_typed(typed: Measurements, drawn: Measurements, nominal: FieldModel | 
         f'{typed.body}: the drawn board puts the coil {away}, and no turn, mirror image, pitch or '
         'order of the places explains it: are they elsewhere?'
     )
+
+
+def _wiring_words(made: ComplexArray, read: ComplexArray, emitters: Sequence[str]) -> str:
+    """What emitters or phases explain readings (F, K) by those made at typed places, in words."""
+    size = np.linalg.norm(made, axis=0)[:, None] * np.linalg.norm(read, axis=0)
+    alike = made.conj().T @ read / np.maximum(size, 1e-300)
+    own = np.diag(alike)
+    lag = DEGREES * float(np.angle(own.sum()))
+    if (np.abs(own) > ALIKE).all() and OTHER_PHASE < abs(lag) < 180.0 - OTHER_PHASE:
+        return f'all readings are {lag:.0f} deg off in phase: is that of the fluxes turned?'
+    weak = np.linalg.norm(read, axis=0) < (1.0 - ALIKE) * np.linalg.norm(made, axis=0)
+    wrong = np.flatnonzero(weak | (own.real < ALIKE))
+    names = ' and '.join(emitters[k] for k in wrong)
+    if not 0 < len(wrong) <= min(2, len(own) // 3):
+        return ''
+    if weak[wrong].all():
+        return f'{names} alone hardly read anything: dead?'
+    if (own[wrong].real < -ALIKE).all():
+        return f'{names} alone read the other way than drawn: wired in reverse?'
+    if len(wrong) == 2 and (alike[wrong, wrong[::-1]].real > ALIKE).all():
+        return f"{names} alone read as each other's coil: are the two exchanged?"
+    return ''
 
 
 def _plate_words(turn: Array, shift: Array) -> str:
@@ -337,8 +381,13 @@ def _calibration(
 def _gaps(typed: Sequence[Measurements]) -> Iterator[str]:
     """Yield a line where typed places are a lattice of which some have no reading."""
     for m in typed:
-        places = np.unique(np.round(m.position[m.usable.any(axis=1)], 3), axis=0)
-        whole = math.prod(len(np.unique(line)) for line in places.T)
+        places = m.position[m.usable.any(axis=1)]
+        near = float(np.median(cKDTree(places).query(places, 2)[0][:, 1])) / 4.0
+        order = np.argsort(places, axis=0)
+        steps = np.diff(np.take_along_axis(places, order, axis=0), axis=0) > near
+        line = np.cumsum(np.vstack([np.zeros((1, 3), bool), steps]), axis=0)
+        places = np.unique(np.take_along_axis(line, np.argsort(order, axis=0), axis=0), axis=0)
+        whole = math.prod((line[-1] + 1).tolist())
         if len(places) < whole <= (1 + MOST_GAPS) * len(places):
             yield (
                 f'{m.body}: {whole - len(places)} of the {whole} places of the lattice have no '

@@ -114,6 +114,11 @@ OTHER_READINGS = (
     *_other_axes(),
 )
 """What people write instead; the first that fits is named."""
+ALSO = {
+    'quaternions with w first': "the probe's axis",
+    'positions with the axes -x, -y, z': 'the order of the places',
+}
+"""What makes the same of typed places that are symmetric, all of one orientation, if reversed."""
 
 
 def check_conventions(path: str, setup: Setup, nominal: NominalBoard, tool: Measurements) -> None:
@@ -135,11 +140,14 @@ def check_conventions(path: str, setup: Setup, nominal: NominalBoard, tool: Meas
     for reading in OTHER_READINGS if share < POOR else ():
         better, _ = fit(reading)
         if better > GOOD:
+            is_typed = not np.ptp(tool.rotation[rows], axis=0).any()
+            also = f'; or is {ALSO[reading.words]} reversed?' if reading.words in ALSO else ''
             span = float(np.linalg.norm(np.ptp(tool.position[rows], axis=0)))
             raise PlausibilityError(
-                f'{path}: optical poses of {tool.body} (positions span {span:.3g} m) explain '
-                f'{100 * share:.0f} % of the fluxes as they stand, and {100 * better:.0f} % when '
-                f'read as {reading.words}'
+                f'{path}: {"typed" if is_typed else "optical"} poses of {tool.body} '
+                f'(positions span {span:.3g} m) explain {100 * share:.0f} % of the fluxes as '
+                f'they stand, and {100 * better:.0f} % when read as '
+                f'{reading.words}{also if is_typed else ""}'
             )
     _check_size(path, setup, field, tool)
 
