@@ -175,6 +175,7 @@ def test_a_plate_of_typed_places_calibrates(setup, heights, most_m):
             lambda places: places * [0.98, 0.98, 1.0],
             r'the plate comes out [12]\.\d % larger than typed',
         ),
+        (lambda places: places * [0.98, 1.0, 1.0], r'along x 1\.\d % larger and along y 0'),
         (lambda places: places + 3e-3 * np.eye(len(places))[24][:, None], r'mm is \d\.\d mm off'),
     ],
 )
@@ -185,8 +186,9 @@ def test_a_pitch_or_a_place_that_is_a_little_wrong_is_said(setup, change, said):
     assert not some.contradictions
     assert '1 of the 49 places of the lattice have no reading' in ' '.join(some.undetermined)
     beside = tool.position + 2e-3 * np.eye(49)[24][:, None] * [1, 0, 0]
-    beside = calibrated(replace(session, tools=(replace(tool, position=beside),)))
+    beside = calibrated(wrongly(session, position=beside, flux=1.06 * tool.flux))
     assert 'of the lattice' not in ' '.join(beside.undetermined)
+    assert re.search(r'all emitters come out \d\.\d % stronger', ' '.join(beside.contradictions))
     with pytest.raises(FitError, match='the drawn board, which such readings suffice for'):
         calibrate_sessions([session], Options(estimate=()))
     wrong = replace(session, tools=(replace(tool, position=change(tool.position)),))

@@ -114,7 +114,7 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
     rows = [
         ('readings per emitter', f'{document["n_measurements"]}'),
         ('dipoles', calibration.layout.describe()),
-        ('damping', f'{calibration.damping:g}'),
+        *([('damping', f'{calibration.damping:g}')] if calibration.damping else []),
         ('residual, T rms', f'{document["flux_rmse_t"]:.4g}'),
         ('held out, T rms', f'{document["heldout_flux_rmse_t"]:.4g}'),
         ('held out, % of the range', f'{document["heldout_n_rmse_percent"]:.4f}'),
@@ -124,7 +124,8 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
     if optical := document['optical_noise']:
         position, rotation = 1e3 * optical['position_m'], DEGREES * optical['rotation_rad']
         jitter = f'{position:.3f} mm, {rotation:.4f} deg'
-        rows.append(('optical jitter a component, at most', jitter))
+        what = 'typed places, error' if document.get('plate') else 'optical jitter'
+        rows.append((f'{what} a component, at most', jitter))
     rows += [(effect.name, _parameters(effect)) for effect in calibration.model.effects]
     for effect in calibration.scan.reported_effects:
         rows.append((f'{effect.name}, not in the model', _parameters(effect)))

@@ -330,14 +330,13 @@ def _few_notes(session: Session) -> tuple[str, ...]:
 def why_withheld(model: FieldModel, evaluation: Evaluation) -> tuple[str, ...]:
     """State why hardly a coil has a pose, or most misfit a model that knows some of them."""
     parameters = [effect.parameters for effect in model.effects]
-    known = sorted({c for one in parameters for c in one.get('channels', [one.get('channel')])})
-    known = [channel for channel in known if channel is not None]
+    each = (p.get('channels', [p['channel']] if 'channel' in p else ()) for p in parameters)
+    known = sorted({channel for channels in each for channel in channels})
     poses = [pose for coil in evaluation.sensors.values() for pose in coil.estimates]
     found = Counter(pose.state for pose in poses)
     worst, count = max(found.items(), key=lambda one: (one[0] != OK, one[1]), default=(OK, 0))
-    if found[OK] > HARDLY * len(poses) and (worst != RESIDUAL or not known):
-        return ()
-    if worst == OK or 2 * count <= len(poses):
+    is_other = worst == RESIDUAL and known and 2 * count > len(poses)
+    if worst == OK or (found[OK] > HARDLY * len(poses) and not is_other):
         return ()
     reasons = [pose.reason for pose in poses if pose.state == worst and pose.reason]
     such = f' ({reasons[len(reasons) // 2]})' if reasons else ''

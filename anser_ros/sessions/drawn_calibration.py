@@ -16,7 +16,15 @@ from scipy.spatial import cKDTree
 
 from anser_ros.arrays import Array, ComplexArray
 from anser_ros.calibration.calibrate import Options
-from anser_ros.calibration.drawn_fit import PLACE, PLATE, SCALE, DrawnFit, DrawnFitter, evenly
+from anser_ros.calibration.drawn_fit import (
+    LEVEL,
+    PLACE,
+    PLATE,
+    SCALE,
+    DrawnFit,
+    DrawnFitter,
+    evenly,
+)
 from anser_ros.calibration.held_out import HeldOutTally
 from anser_ros.calibration.layout_fit import RICH
 from anser_ros.calibration.layouts import Generator, Layout
@@ -397,20 +405,38 @@ def _gaps(typed: Sequence[Measurements]) -> Iterator[str]:
 
 def _doubts(fit: DrawnFit, generator: Generator) -> tuple[str, ...]:
     """A line for a plate, and for each of its places, that is off by far more than such are."""
-    lines, arms = [], generator.centres - generator.middle
-    scale = float(fit.plate[6] - (arms * fit.errors[:, :3]).sum() / (arms**2).sum())
-    usual = float(np.hypot(PLATE[6], SCALE))
-    if abs(scale) > FAR * usual:
-        size = f'{100 * abs(scale):.1f} % {"larger" if scale > 0 else "smaller"}'
-        true = f'and plate and board are true to {100 * usual:.1f} %'
+    lines, shared = [], float(np.median(fit.errors[:, 6]))
+    if abs(shared) > CLEAR * LEVEL[0]:
+        way = 'stronger' if shared > 0.0 else 'weaker'
         lines.append(
-            f'the plate comes out {size} than typed beside the board, {true}: is the pitch right?'
+            f'all emitters come out {100 * abs(shared):.1f} % {way} than drawn (median): '
+            "is the probe's gain or the current stated wrongly?"
         )
     typed = [part for part in fit.parts if part.is_typed]
     if not typed:
         return tuple(lines)
     place = np.concatenate([part.stated.position for part in typed])
-    away = np.concatenate([np.linalg.norm(part.offset[:, :3], axis=1) for part in typed])
+    offset = np.concatenate([part.offset[:, :3] for part in typed])
+    arms, ways = generator.centres - generator.middle, place - place.mean(axis=0)
+    scale = float(fit.plate[6] - (arms * fit.errors[:, :3]).sum() / (arms**2).sum())
+    along = (ways * offset).sum(axis=0)[:2] / (ways**2).sum(axis=0)[:2]
+    usual = float(np.hypot(PLATE[6], SCALE))
+    sizes = {'the plate comes out': scale}
+    if abs(along[0] - along[1]) > FAR * usual:
+        sizes = dict(zip(('the plate comes out along x', 'along y'), scale + along, strict=True))
+        offset[:, :2] -= along * ways[:, :2]
+    if few := _few_words(generator):
+        lines.append(few[2:])
+    elif max(map(abs, sizes.values())) > FAR * usual:
+        said = (
+            f'{k} {100 * abs(v):.1f} % {"larger" if v > 0 else "smaller"}'
+            for k, v in sizes.items()
+        )
+        lines.append(
+            f'{" and ".join(said)} than typed beside the board, and plate and board are true to '
+            f'{100 * usual:.1f} %: is the pitch right? Measure it, and type the places anew'
+        )
+    away = np.linalg.norm(offset, axis=1)
     weight = np.concatenate([part.weights.max(axis=1) for part in typed])
     doubted = (away > FAR * PLACE[0]) | ((weight > 0.0) & (weight < OUTLIER_WEIGHT))
     worst = np.flatnonzero(doubted)
