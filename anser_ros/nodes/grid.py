@@ -58,15 +58,15 @@ class GridGuide(AnserNode):
         self._places = places_of(plate, pitch, [1e-3 * one for one in height_mm])
         rows = [','.join(f'{1e3 * value:.3f}' for value in place) for place in self._places]
         words, listed = '\n'.join(['x_mm,y_mm,z_mm', *rows, '']), out.with_suffix('.csv')
-        if out.suffix != '.mcap':
-            raise ParameterError(f'{out}: --out must end in .mcap')
-        if not out.absolute().parent.is_dir():
-            raise ParameterError(f'{out}: there is no such folder')
-        if out.exists():
-            raise ParameterError(f'{out}: already exists')
-        if listed.exists() and listed.read_bytes() != words.encode():
-            reason = 'already exists, and is no list of these places'
-            raise ParameterError(f'{listed}: {reason}; give --out another name')
+        is_other = listed.exists() and listed.read_bytes() != words.encode()
+        for is_wrong, reason in (
+            (out.suffix != '.mcap', f'{out}: --out must end in .mcap'),
+            (not out.absolute().parent.is_dir(), f'{out}: there is no such folder'),
+            (out.exists(), f'{out}: already exists'),
+            (is_other, f'{listed}: already exists with other text; give --out another name'),
+        ):
+            if is_wrong:
+                raise ParameterError(reason)
         super().__init__(**options)
         listed.write_text(words, 'utf-8')
         for name in ACTIONS:

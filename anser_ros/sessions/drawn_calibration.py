@@ -237,11 +237,10 @@ def check_typed(typed: Measurements, drawn: Measurements, nominal: FieldModel | 
         )
     middle, centre = places[known].mean(axis=0), there[known].mean(axis=0)
     if middle[2] < NO_HEIGHT_M and centre[2] - middle[2] > NEAR_M:
-        side = 'below' if middle[2] < 0.0 else 'over'
-        why = 'z reversed, or the plate upside down' if middle[2] < 0.0 else 'the height missing'
+        at = f'{1e3 * abs(middle[2]):.0f} mm {"below" if middle[2] < 0.0 else "over"}'
         raise FitError(
-            f'{typed.body}: the plate is typed {1e3 * abs(middle[2]):.0f} mm {side} the board and '
-            f'lies {1e3 * centre[2]:.0f} mm above it: is {why}?'
+            f'{typed.body}: the plate is typed {at} the board and lies {1e3 * centre[2]:.0f} mm '
+            'above it: is the height missing, z reversed, or the plate upside down?'
         )
     gain = float(np.vdot(made, read).real / np.vdot(made, made).real)
     size = float(np.linalg.norm(read - gain * made) / np.linalg.norm(made))
@@ -259,11 +258,11 @@ def check_typed(typed: Measurements, drawn: Measurements, nominal: FieldModel | 
     wrong = np.concatenate([[0], np.cumsum(off[:-1] > NEAR_M)])
     wrong[:-1] += np.cumsum(later[::-1])[::-1]
     missed, last = np.flatnonzero(wrong == wrong.min())[[0, -1]].tolist()
-    one = f'one of the typed places {missed + 1} to {last + 1}'
-    one = one if last > missed else f'the typed place {missed + 1}'
+    which = f'one of the typed places {missed + 1} to {last + 1}'
+    which = which if last > missed else f'the typed place {missed + 1}'
     if wrong[missed] <= MOST_ASTRAY * known.sum() and missed < len(places) - 1:
         raise FitError(
-            f'{typed.body}: {one} was missed: from '
+            f'{typed.body}: {which} was missed: from '
             f'there on each reading belongs to the next place, {1e3 * pitch:.0f} mm or more off'
         )
     arms, ways = places[known] - middle, there[known] - centre
@@ -310,7 +309,7 @@ def _wiring_words(made: ComplexArray, read: ComplexArray, emitters: Sequence[str
         return f'all readings are {lag:.0f} deg off in phase: is that of the fluxes turned?'
     weak = np.linalg.norm(read, axis=0) < (1.0 - ALIKE) * np.linalg.norm(made, axis=0)
     wrong = np.flatnonzero(weak | (own.real < ALIKE))
-    names = ' and '.join(emitters[k] for k in wrong)
+    names = ' and '.join(emitters[k] for k in wrong.tolist())
     if not 0 < len(wrong) <= min(2, len(own) // 3):
         return ''
     if weak[wrong].all():
@@ -419,22 +418,20 @@ def _doubts(fit: DrawnFit, generator: Generator) -> tuple[str, ...]:
     offset = np.concatenate([part.offset[:, :3] for part in typed])
     arms, ways = generator.centres - generator.middle, place - place.mean(axis=0)
     scale = float(fit.plate[6] - (arms * fit.errors[:, :3]).sum() / (arms**2).sum())
-    along = (ways * offset).sum(axis=0)[:2] / (ways**2).sum(axis=0)[:2]
+    along = (ways * offset).sum(axis=0)[:2] / np.maximum((ways**2).sum(axis=0)[:2], 1e-12)
     usual = float(np.hypot(PLATE[6], SCALE))
-    sizes = {'the plate comes out': scale}
+    sizes = {'': scale}
     if abs(along[0] - along[1]) > FAR * usual:
-        sizes = dict(zip(('the plate comes out along x', 'along y'), scale + along, strict=True))
+        sizes = dict(zip((' along x', ' along y'), scale + along, strict=True))
         offset[:, :2] -= along * ways[:, :2]
     if few := _few_words(generator):
         lines.append(few[2:])
     elif max(map(abs, sizes.values())) > FAR * usual:
-        said = (
-            f'{k} {100 * abs(v):.1f} % {"larger" if v > 0 else "smaller"}'
-            for k, v in sizes.items()
-        )
+        ways_off = ((k, 100 * abs(v), 'larger' if v > 0 else 'smaller') for k, v in sizes.items())
+        said = ' and'.join(f'{k} {size:.1f} % {way}' for k, size, way in ways_off)
         lines.append(
-            f'{" and ".join(said)} than typed beside the board, and plate and board are true to '
-            f'{100 * usual:.1f} %: is the pitch right? Measure it, and type the places anew'
+            f'the plate comes out{said} than typed beside the board, and plate and board are true '
+            f'to {100 * usual:.1f} %: is the pitch right? Measure it, and type the places anew'
         )
     away = np.linalg.norm(offset, axis=1)
     weight = np.concatenate([part.weights.max(axis=1) for part in typed])
