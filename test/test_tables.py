@@ -164,6 +164,11 @@ REFUSED = {
         rows_of('', *((9 - k % 3, *r[1:]) for k, r in enumerate(ROWS)), separator=' '),
         'the times do not ascend',
     ),
+    'a counter that wraps': (
+        rows_of('time_ms,x,y,z,qx,qy,qz,qw',
+                *(((62000 + 500 * k) % 65536, *ROWS[k][1:]) for k in range(12))),
+        'line 10: the time falls by 65.04 s, more than it ever rises',
+    ),
     'stamps that are never set': (
         rows_of('time,x,y,z,qx,qy,qz,qw', *((0, *r[1:]) for r in ROWS)), 'all 12 times are 0 s'
     ),

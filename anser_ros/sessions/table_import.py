@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
 from anser_ros.sessions.plausibility import check_positions
-from anser_ros.stamps import stamp_fault
+from anser_ros.stamps import NANO, stamp_fault
 from anser_ros.wire import recorded
 from anser_ros.wire.bag_writer import FLUX_TOPICS, SessionWriter
 from anser_ros.wire.number_tables import NumberTable, read_arrays
 from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
 from anser_ros.wire.setup_values import read_name
 from anser_ros.wire.table_names import LENGTH_M, TIME_NS
+from anser_ros.wire.tables import Span, check_apart, check_rising
 from anser_ros.wire.text_files import read_text, read_yaml
 
 Array = NDArray[Any]
@@ -105,6 +106,7 @@ class _Import:
         self._entries: list[tuple[int, Callable[..., None]]] = []
         self._tables: dict[Path, NumberTable] = {}
         self._messages: Counter[str] = Counter()
+        self._spans: list[Span] = []
         self.notes: list[str] = []
         for key, entries in tables.items():
             for number, entry in enumerate(entries):
@@ -153,6 +155,8 @@ class _Import:
         if (different := len(set(stamps))) < 2 and len(stamps) != 1:
             words = f'all {len(stamps)} stamps are alike: are they set?' if stamps else 'no rows'
             raise ParameterError(f'{table.path}: {words}')
+        lines = range(1, len(stamps) + 1) if table.table is None else table.table.cells.index
+        check_rising(table.path, np.array(stamps) * NANO, lines)
         if fault := stamp_fault(min(stamps), max(stamps)) or '1970' * (min(stamps) <= 0):
             fault = fault if min(stamps) > 0 else 'a stamp is not after 1970; is start_ns missing?'
             raise ParameterError(f'{table.path}: {fault}')
@@ -211,6 +215,7 @@ class _Import:
         if order not in ORDERS:
             raise ParameterError(f'{what}: order must be {" or ".join(ORDERS)}, got {order!r}')
         stamps = self._stamps(table, entry)
+        check_apart(self._spans, topic, table.path, np.array(stamps) * NANO)
         position, quaternion = (
             _real(table.columns(entry.get(k), n, f'{what}: {k}', entry.get('stamp')), table, k)
             for k, n in (('position', 3), ('quaternion', 4))

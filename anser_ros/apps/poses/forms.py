@@ -19,7 +19,7 @@ from anser_ros.sessions.table_import import SCHEMA
 from anser_ros.stamps import NANO, RECENT_NS, SECOND_NS
 from anser_ros.wire import recorded
 from anser_ros.wire.table_names import TIME_NS, UNITS, meaning_of, pose_columns, words_of
-from anser_ros.wire.tables import Table, read_table
+from anser_ros.wire.tables import Table, check_rising, read_table
 from anser_ros.wire.text_files import read_text
 
 ORDERS = {
@@ -71,6 +71,7 @@ class RawRows:
     rows: list[tuple[float, ...]] = field(default_factory=list)
     form: str = 'xyzw'  # how its quaternions are written, a key of `ORDERS`
     unit: str = 'mm'  # unit of its lengths, a key of `LENGTH_M`; empty where it is not stated
+    assumed_hz: float = 0.0  # counts a second of a device that does not say what it is
 
     @property
     def table(self) -> Array:
@@ -82,11 +83,11 @@ Found = tuple[dict[str, RawRows], int]
 """Rows by the sensor's name, and a number of lines."""
 
 
-def read_form(path: Path) -> Found:
+def read_form(path: Path, unit: str | None = None) -> Found:
     """Read a file of any known form: its rows, and how many lines hold no pose and no marker.
 
     Lines before the first that has the form, such as a title, are left out. Raises
-    `ParameterError` when no form fits, or the file has no row.
+    `ParameterError` when no form fits, a header states another ``unit``, or the file has no row.
     """
     if path.suffix.lower() in PLUS:
         return _plus(path), 0
@@ -100,7 +101,7 @@ def read_form(path: Path) -> Found:
             rows, read = _keyed(lines[first:], path)
             break
     else:
-        rows, read = _table(path), len(lines)
+        rows, read = _table(path, unit), len(lines)
     if not any(one.rows for one in rows.values()):
         raise ParameterError(f'{path}: no row that is a pose')
     return rows, len(lines) - read
@@ -129,7 +130,8 @@ def _tool_tracker(lines: Sequence[str]) -> Found:
                 continue
             label = re.sub(r'\W+', '_', port[0].split(':')[0].strip().lower())
             rate = POLARIS_HZ if 'OT' in port[0] else AURORA_HZ
-            one = rows.setdefault(label, RawRows(form='wxyz'))
+            new = RawRows(form='wxyz', assumed_hz=0.0 if label else rate)
+            one = rows.setdefault(label or f'port_{1 + start // PORT_COLUMNS}', new)
             numbers = [_number(cell) for cell in port[4:11]]
             good = port[3].strip() in ('OK', 'Partially Out of Volume')
             pose = (*numbers[4:7], *numbers[:4]) if good else (float('nan'),) * 7
@@ -185,7 +187,7 @@ def _plus(path: Path) -> dict[str, RawRows]:
     return rows
 
 
-def _table(path: Path) -> dict[str, RawRows]:
+def _table(path: Path, unit: str | None) -> dict[str, RawRows]:
     """A table with names of columns, or one of TUM's eight numbers."""
     table = read_table(path)
     names = table.names if table.has_names else TUM
@@ -195,7 +197,7 @@ def _table(path: Path) -> dict[str, RawRows]:
         raise ParameterError(f'{path}: {words}; times, places and quaternions are 8{matrix}')
     try:
         bodies, clocks = pose_columns(names, table.units)
-        time = np.sum([_seconds(table, column, unit) for column, unit in clocks], axis=0)
+        time = np.sum([_seconds(table, *clock) for clock in clocks], axis=0)
     except ParameterError as error:
         raise ParameterError(
             f'{error}' if str(path) in f'{error}' else _advice(table, error)
@@ -212,9 +214,12 @@ def _table(path: Path) -> dict[str, RawRows]:
         for name in dict.fromkeys(whose.tolist()):
             here = whose == name
             _check_times(path, time[here])
+            check_rising(path, time[here], table.cells.index[here])
             lines = np.column_stack([time[here], np.full(here.sum(), np.nan), pose[here]])
             called = '_'.join(filter(None, (name, body))) if name or len(bodies) > 1 else path.stem
             rows[called] = RawRows(lines.tolist(), unit=columns.unit or stated)
+            if unit and rows[called].unit not in (unit, ''):
+                raise ParameterError(f'{path}: its header says {rows[called].unit}, --unit {unit}')
     return rows
 
 

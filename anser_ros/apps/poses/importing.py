@@ -24,6 +24,7 @@ from anser_ros.wire import recorded
 from anser_ros.wire.bag import Salvage, published_poses
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.table_names import LENGTH_M
+from anser_ros.wire.tables import Span, check_apart
 
 Piece = tuple[str, Array, Array, Array]
 """Name of a stream, and of one of its recordings times, s, positions, m, and quaternions."""
@@ -69,6 +70,7 @@ def import_poses(
             'they belong together one by one'
         )
     recordings: list[dict[str, Array]] = []
+    seen: list[Span] = []
     lost: list[str] = []
     for path, other in zip_longest(tracked, reference):
         groups = _named(path, None, unit, quaternion, lost)
@@ -76,6 +78,8 @@ def import_poses(
             if REFERENCE in groups:  # a file that says nothing of its sensor
                 groups['sensor_0'] = groups.pop(REFERENCE)
             groups |= _named(other, REFERENCE, None, None, lost)
+        for label in groups.keys() - {REFERENCE}:
+            check_apart(seen, label, path, groups[label][:, 0])
         recordings.append(groups)
     pieces = _placed(recordings, stamps, shift_s)
     called = _called([piece[0] for piece in pieces], names or {})
@@ -151,7 +155,7 @@ def _named(
     """Each group of a file's rows (n, 9) under its name, with positions in m and quaternions
     x y z w; what is left out is added to what is lost.
     """
-    rows, unread = read_form(path)
+    rows, unread = read_form(path, unit)
     if unread:
         lost.append(f'lines of {path} that are no poses, and are left out: {unread}')
     if name is not None:  # of an optical file only the tool with most poses is the reference
@@ -160,6 +164,8 @@ def _named(
     found = {}
     for label, one in rows.items():
         table = one.table
+        if one.assumed_hz:
+            lost.append(f'{label}: no time; {one.assumed_hz:g} frames a second are assumed')
         if not np.isfinite(table[:, :2]).any():
             raise ParameterError(f'{path}: {label}: no pose has a time')
         order, sense = ORDERS[quaternion or one.form]

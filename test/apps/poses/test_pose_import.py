@@ -119,6 +119,11 @@ def test_tum_csv_and_static_files_one_after_the_other(tmp_path):
     poses = import_poses([table]).sensors['tip']
     np.testing.assert_allclose(poses.position, [[0.001, 0.002, 0.003]])
     np.testing.assert_allclose(poses.missing, [0.1])
+    with pytest.raises(ParameterError, match='its header says mm, --unit cm'):
+        import_poses([table], unit='cm')
+    again = write(tmp_path / 'b.csv', *table.read_text().replace(',1,2,3', ',9,2,3').split())
+    with pytest.raises(ParameterError, match=r'a\.csv and .*b\.csv both give tip, at the same'):
+        import_poses([table, again])
     files, optical = [], []
     for n in range(2):
         rows = [(cell(8),), (cell(16),)], [(cell(3),), (cell(6),)]
