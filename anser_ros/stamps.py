@@ -81,8 +81,17 @@ RECENT_NS = 946_684_800 * SECOND_NS
 """Start of the year 2000, ns: a recording's stamps are not before."""
 
 
-def stamp_fault(first_ns: int, last_ns: int) -> str:
-    """Return why times, ns, cannot be stamps, and what mends it; empty where they can."""
+EPOCHS_OF_DAYS = {
+    '1899-12-30 (Excel)': -2_209_161_600, 'the year 0 (MATLAB)': -62_167_305_600,
+}  # fmt: skip
+"""Where programs begin that count days; Excel's year 1900 has a day too many."""
+
+
+def stamp_fault(first_ns: int, last_ns: int, of_days: bool = False) -> str:
+    """Return why times, ns, cannot be stamps, and what mends it; empty where they can.
+
+    ``of_days``: whether they were counted in days.
+    """
     if first_ns >= 0 and last_ns <= LATEST_NS:
         return ''
     if first_ns < 0:
@@ -90,10 +99,10 @@ def stamp_fault(first_ns: int, last_ns: int) -> str:
         return f'times of {first_ns * NANO:g} s {words}'
     day = datetime.fromtimestamp(min(first_ns // SECOND_NS, LAST_DAY_S), UTC)
     words = f'times of {day:%Y-%m-%d}, beyond what a ROS stamp holds (2038-01-19)'
-    for name, start_s in EPOCHS.items():
+    for name, start_s in (EPOCHS_OF_DAYS if of_days else EPOCHS).items():
         start_ns = start_s * SECOND_NS
         # What was recorded was not recorded later than now.
         if first_ns + start_ns >= RECENT_NS and last_ns + start_ns <= time.time_ns():
             remedy = f'start_ns: {start_ns}, or import_poses --shift {start_s}'
-            return f'{words}: seconds since {name}? {remedy}'
+            return f'{words}: {"days" if of_days else "seconds"} since {name}? {remedy}'
     return f'{words}; they cannot be stamps of a bag: is the unit of time right?'

@@ -246,6 +246,17 @@ def test_a_header_that_is_not_understood_leaves_a_document_that_can_be_filled_in
     with pytest.raises(ParameterError):
         import_poses([path])
     assert yaml.safe_load(document.read_text()) == written
+    written['tracked'][0] |= {'stamp': 'Zeit [s]', 'quaternion': ['q a', 'q [b]', 'q[0]', 'qd']}
+    written['time'] = {'unit': 'day', 'start_ns': 0}
+    days = [(45000 + k / 86400, *r[1:]) for k, r in enumerate(ROWS)]
+    path.write_text(text_of(',', ['Zeit [s]', *NAMES[1:4], 'q a', 'q [b]', 'q[0]', 'qd'], days))
+    document.write_text(yaml.safe_dump(written))
+    command = ['import', str(document), '--out', str(tmp_path / 'days.mcap')]
+    assert main(command) == 2
+    assert 'days since 1899-12-30 (Excel)? start_ns: -2209161600' in capsys.readouterr().err
+    written['time']['start_ns'] = -2209161600 * 10**9
+    document.write_text(yaml.safe_dump(written))
+    assert main(command) == 0
 
 
 def test_bodies_side_by_side_and_rows_that_are_no_pose(tmp_path):

@@ -157,7 +157,8 @@ class _Import:
             raise ParameterError(f'{table.path}: {words}')
         lines = range(1, len(stamps) + 1) if table.table is None else table.table.cells.index
         check_rising(table.path, np.array(stamps) * NANO, lines)
-        if fault := stamp_fault(min(stamps), max(stamps)) or '1970' * (min(stamps) <= 0):
+        is_days = unit_ns == TIME_NS['day']
+        if fault := stamp_fault(min(stamps), max(stamps), is_days) or '1970' * (min(stamps) <= 0):
             fault = fault if min(stamps) > 0 else 'a stamp is not after 1970; is start_ns missing?'
             raise ParameterError(f'{table.path}: {fault}')
         if different < len(stamps):

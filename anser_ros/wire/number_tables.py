@@ -39,18 +39,25 @@ class NumberTable:
             raise ParameterError(f'{self.path}: no {name!r}; there are: {known}')
         return self.arrays[name]
 
+    def _parts(self, reference: Any) -> tuple[str, str]:
+        """Name of an array and its further indices; what is a column's name as a whole is that."""
+        text = str(reference)
+        if text in (self.arrays if self.table is None else self.table.names):
+            return text, ''
+        if (match := REFERENCE.match(text)) is None:
+            raise ParameterError(f'{self.path}: {reference!r} is not a column, such as x or x[3]')
+        return match[1], match[2] or ''
+
     def column(self, reference: Any) -> NDArray[Any]:
         """Return a column (N,): ``time``, ``flux[0, 3]``; raises `ParameterError` for no such."""
-        match = REFERENCE.match(str(reference))
-        if match is None:
-            raise ParameterError(f'{self.path}: {reference!r} is not a column, such as x or x[3]')
-        found = self.array(match[1])
-        rest = tuple(int(i) for i in match[2].split(',')) if match[2] else ()
+        name, indices = self._parts(reference)
+        found = self.array(name)
+        rest = tuple(int(i) for i in indices.split(',')) if indices else ()
         if found.ndim == 2 and 1 in found.shape and not rest:  # MATLAB has no plain vectors
             found = found.ravel()
         if found.ndim != 1 + len(rest):
             raise ParameterError(
-                f'{self.path}: {match[1]} has shape {found.shape}, so {reference} is not a column'
+                f'{self.path}: {name} has shape {found.shape}, so {reference} is not a column'
             )
         if any(i >= n for i, n in zip(rest, found.shape[1:], strict=True)):
             raise ParameterError(f'{self.path}: {reference} is beyond shape {found.shape}')
@@ -65,7 +72,7 @@ class NumberTable:
         for reference in references:
             if (found := len(self.column(reference))) != many:
                 words = f'{beside} has {many} rows, {reference} {found}'
-                if many in self.array(str(reference).partition('[')[0].strip()).shape[1:]:
+                if many in self.array(self._parts(reference)[0]).shape[1:]:
                     words += f'; its rows are {many} along the other axis: transpose it'
                 raise ParameterError(f'{self.path}: {words}')
         return np.stack([self.column(reference) for reference in references], axis=1)
