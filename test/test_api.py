@@ -185,6 +185,10 @@ def test_what_is_none_is_refused(tmp_path):
         (lambda s, m: m.flux('a', 'b'), 'positions must be numbers'),
         (lambda s, m: m.field([0.0, 0.0]), r'points must be \(\.\.\., 3\)'),
         (lambda s, m: plot_field(m, 'k9'), "no emitter 'k9'"),
+        (lambda s, m: plot_field('nominal'), 'give Model.nominal'),
+        (lambda s, m: m.field([0.0, 0.0, 150.0]), 'points must be finite and below 10 m'),
+        (lambda s, m: m.flux([0.0, np.nan, 0.1], [0.0, 0.0, 1.0]), 'positions must be finite'),
+        (lambda s, m: track(s, m, progress='x'), 'progress must be True or a function'),
         (lambda s, m: plot_field(m, normal='w'), 'normal must be x, y or z'),
         (lambda s, m: simulate(SETUP, 5), 'times, positions and quaternions'),
         (lambda s, m: simulate(SETUP, {}), 'poses at the same times of pen'),
@@ -233,7 +237,9 @@ def test_tracks_are_saved_as_arrays(tmp_path):
     result = track(session, str(REPO / 'config' / 'demo_model.yaml'))
     result.save(str(tmp_path / 'poses.npz'))
     assert len(repr(result)) < 2000 and 'tool_a: 200 of 200 frames' in repr(result)
-    assert dict(result).keys() == set(result)
+    assert dict(result).keys() == set(result) and len(result) == len(result.values()) == 10
+    with pytest.raises(KeyError, match="no 'nix'; there are: tool_a, "):
+        result['nix']
     whole = result.to_dataframe()
     assert len(whole) == 2000 and set(whole['name']) == set(result)
     table = result['tool_a'].to_dataframe()

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from anser_ros.errors import ParameterError
 from anser_ros.sessions.session import Session, load_session
 
 SessionSource = Session | str | os.PathLike[str]
@@ -23,6 +24,8 @@ def session_given(given: SessionSource) -> Session:
 @contextmanager
 def shown(progress: Progress, stage: str) -> Iterator[Callable[..., None] | None]:
     """Yield what is called with a stage in words, a finished share, or both; None for nothing."""
+    if not (progress is None or callable(progress) or isinstance(progress, bool)):
+        raise ParameterError(f'progress must be True or a function, got {progress!r}')
     last = ''
 
     def draw(*told: Any) -> None:

@@ -83,8 +83,8 @@ class TrackedPoses:
 
 
 @dataclass(frozen=True)
-class TrackingResult:
-    """Holds the poses of all coils and bodies of a session.
+class TrackingResult(Mapping[str, TrackedPoses]):
+    """Holds the poses of all coils and bodies of a session: a mapping by their names.
 
     Attributes
     ----------
@@ -100,14 +100,16 @@ class TrackingResult:
 
     def __getitem__(self, name: str) -> TrackedPoses:
         """Poses of a body or, where no body has that name, of a sensor; raises KeyError."""
-        return self.bodies[name] if name in self.bodies else self.sensors[name]
-
-    def keys(self) -> tuple[str, ...]:
-        """Return the names of bodies and sensors, so that ``dict(result)`` works."""
-        return (*self.bodies, *self.sensors)
+        found = self.bodies.get(name, self.sensors.get(name))
+        if found is None:
+            raise KeyError(f'no {name!r}; there are: {", ".join(self)}')
+        return found
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.keys())
+        return iter({**self.bodies, **self.sensors})
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
 
     def __repr__(self) -> str:
         return f'TrackingResult({", ".join(map(repr, (self[name] for name in self)))})'

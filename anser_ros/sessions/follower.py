@@ -86,9 +86,7 @@ class ModelFollower(ModelHalf):
         if session.reference is None:
             raise BagError(f'{session.path}: a refit needs reference fluxes, the session has none')
         if baseline is None:
-            raise BagError(
-                'a refit needs --baseline, a distortion-free recording of the same board'
-            )
+            raise BagError('a refit needs a baseline: a distortion-free recording of the board')
         try:
             fewest = min(session.setup.refit.min_references, len(session.reference.sensors))
             check_enough(baseline.flux, fewest)
