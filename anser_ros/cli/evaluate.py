@@ -236,7 +236,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options that hold for every session."""
-    output.add_session_options(parser)
+    output.add_session_options(parser, idle='optical_rotation_rad')
     words = 'let the model follow the reference sensors'
     parser.add_argument('--refit', action='store_true', help=words)
     words = 'reference sensors that the refit may use; the others are ignored'

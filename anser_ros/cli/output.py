@@ -41,11 +41,11 @@ def add_list(parser: argparse.ArgumentParser, option: str, **options: Any) -> No
     parser.add_argument(option, action='append', default=[], **options)
 
 
-def add_stated_values(parser: argparse.ArgumentParser, *sections: str) -> None:
+def add_stated_values(parser: argparse.ArgumentParser, *sections: str, idle: str = '') -> None:
     """Declare ``--set``; ``sections`` of `SECTIONS` are those that the command uses."""
     from anser_ros.settings import SECTIONS
 
-    names = [name for section in sections for name in SECTIONS[section]]
+    names = [name for section in sections for name in SECTIONS[section] if name != idle]
     words = 'state a value in place of the setup document and the default; may be repeated. Names:'
     words = f'{words} {", ".join(names)}'
     add_list(parser, '--set', dest='stated', metavar='NAME=VALUE', help=words)
@@ -75,8 +75,8 @@ def add_model(parser: argparse.ArgumentParser, **options: Any) -> None:
     parser.add_argument('--model', help=words, **options)
 
 
-def add_session_options(parser: argparse.ArgumentParser) -> None:
-    """Declare what a session is taken with: a model, a baseline, bodies surveyed again."""
+def add_session_options(parser: argparse.ArgumentParser, idle: str = '') -> None:
+    """Declare what a session is taken with; ``idle`` is a value without effect, not to state."""
     add_model(parser)
     parser.add_argument('--baseline', help='distortion-free recording of the same board')
     add_list(
@@ -85,7 +85,7 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
         'channels are corrected as the model says, and their places and axes are those of '
         'the session; may be repeated',
     )  # fmt: skip
-    add_stated_values(parser, 'accuracy', 'refit', 'tools')
+    add_stated_values(parser, 'accuracy', 'refit', 'tools', idle=idle)
 
 
 _made: list[Path] = []

@@ -7,7 +7,8 @@ without. What is lost of what the description counts is stated too.
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from mcap.records import Channel, Schema
 from mcap_ros2.decoder import DecoderFactory
 
 from anser_ros.errors import BagError, LayoutError, SetupError
-from anser_ros.stamps import stamp_of
+from anser_ros.stamps import JUMP_NS, stamp_of
 from anser_ros.wire import recorded
 from anser_ros.wire.bag_files import Salvage as Salvage
 from anser_ros.wire.bag_files import files_of, messages_in, unpacked
@@ -207,6 +208,8 @@ def read_bag(path: str | os.PathLike[str]) -> recorded.Bag:
         collector.add(raw)
     if not collector.setups:
         raise BagError(f'{os.fspath(path)}: the bag has no setup; anser import --setup adds one')
+    if Path(path).is_dir() and not Path(path, 'metadata.yaml').is_file():
+        _check_one_session(os.fspath(path), collector)
     text = collector.setups[-1]  # acquisition adds rate and noise once its stream is there
     try:
         setup = parse_setup(text)
@@ -221,6 +224,21 @@ def read_bag(path: str | os.PathLike[str]) -> recorded.Bag:
         os.fspath(path), setup, text, tool, reference, collector.pose_streams(),
         dict(collector.refused), salvage.lost,
     )  # fmt: skip
+
+
+def _check_one_session(path: str, found: _Collector) -> None:
+    """Refuse a folder of several sessions: of other boards, or fluxes twice at the same time."""
+    with suppress(SetupError):  # which is said of the last
+        first, *others = (parse_setup(text) for text in dict.fromkeys(found.setups))
+        if any((s.emitter, s.sensors) != (first.emitter, first.sensors) for s in others):
+            raise BagError(f'{path}: sessions of several boards or sensors; read them one by one')
+    for which, fluxes in found.flux.items():
+        stamps = np.array([stamp for stamp, _ in fluxes], dtype=np.int64)
+        falls = np.flatnonzero(np.diff(stamps) < -JUMP_NS) + 1
+        spans = sorted((run.min(), run.max()) for run in np.split(stamps, falls) if run.size)
+        if any(after[0] < before[1] for before, after in pairwise(spans)):
+            words = f'several sessions, as {which}/flux has times twice; read them one by one'
+            raise BagError(f'{path}: {words}')
 
 
 def read_fluxes(path: str | os.PathLike[str]) -> dict[str, recorded.RecordedFluxes]:

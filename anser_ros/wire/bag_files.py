@@ -28,6 +28,7 @@ from mcap.records import Channel, Chunk, DataEnd, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from anser_ros.errors import BagError
+from anser_ros.wire.number_tables import ENDINGS
 from anser_ros.wire.text_files import read_yaml
 
 _BROKEN = (
@@ -125,9 +126,12 @@ def _records(stream: io.BufferedReader, salvage: Salvage, size: int) -> Iterator
             yield from inner
     except _BROKEN as error:
         why = ': '.join(filter(None, (type(error).__name__, ' '.join(str(error).split())[:120])))
-        salvage.add(f'the bag breaks off after {whole} of {size} bytes ({why})')
         stream.seek(whole)
-        yield from _rest_of_chunk(stream.read(_RECORD_LIMIT))
+        rest = list(_rest_of_chunk(stream.read(_RECORD_LIMIT)))
+        count = sum(isinstance(record, Message) for record in rest)
+        more = f', and {count} messages of the next chunk are read' if count else ''
+        salvage.add(f'the bag breaks off after {whole} of {size} bytes ({why}){more}')
+        yield from rest
     if bad_chunks:
         salvage.add(f'{bad_chunks} chunks with a bad checksum or size left out')
 
@@ -194,6 +198,9 @@ def files_of(path: Path, salvage: Salvage) -> tuple[list[Path], int]:
             names = [Path(str(name)).name for name in about['relative_file_paths']]
     except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError, AttributeError):
         salvage.add('metadata.yaml cannot be read, and its files are taken by name')
+    if len(names) > 1 and not described.is_file():
+        joined = ', '.join(names)
+        salvage.add(f'{len(names)} files that no metadata.yaml joins are read as one: {joined}')
     files = []
     for name in names:
         near = [f for f in there if f.name.removesuffix(ZSTD) == name.removesuffix(ZSTD)]
@@ -207,13 +214,15 @@ def files_of(path: Path, salvage: Salvage) -> tuple[list[Path], int]:
 
 
 def _kind(path: Path) -> str:
-    return Path(path.name.removesuffix(ZSTD)).suffix
+    return Path(path.name.removesuffix(ZSTD)).suffix.lower()
 
 
 def messages_in(path: Path, stack: ExitStack, salvage: Salvage) -> Iterator[Found]:
     """The messages of a file, which is unpacked if need be."""
     if _kind(path) not in ('.db3', '.mcap'):
         remedy = '; rosbags-convert turns bags of ROS 1 into those' * (path.suffix == '.bag')
+        if path.suffix.lower() in ENDINGS:
+            remedy = '; of a table anser import_poses makes one, or anser import of a tables.yaml'
         raise BagError(f'{path}: neither .db3 nor .mcap{remedy}')
     logs = [log for end in LOGS if (log := Path(f'{path}{end}')).is_file()]
     plain, size = path, 0 if _kind(path) == '.mcap' else _stated_size(path)
@@ -235,9 +244,9 @@ def messages_in(path: Path, stack: ExitStack, salvage: Salvage) -> Iterator[Foun
         if log.name.endswith(LOGS[0]) and _breaks_off(log.read_bytes()):
             salvage.add(f'{log.name} breaks off: what was written last is lost')
     try:
-        if plain.suffix == '.db3':
+        if _kind(plain) == '.db3':
             yield from _sqlite(plain, salvage)
-        for part in _apart(plain, stack, salvage) if plain.suffix == '.mcap' else ():
+        for part in _apart(plain, stack, salvage) if _kind(plain) == '.mcap' else ():
             yield from _mcap(part, salvage)
     except BagError as error:  # about what was unpacked, which nobody knows
         raise BagError(str(error).replace(str(plain), str(path))) from error
