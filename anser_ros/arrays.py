@@ -26,12 +26,17 @@ def pairs_of(values: ComplexArray) -> Any:
     return np.stack([values.real, values.imag], axis=-1).tolist()
 
 
-def numbers_of(given: ArrayLike, what: str, last: int | None = None) -> Array:
-    """Return an array, whose last axis has a length; raises `ParameterError` if it is none."""
+def numbers_of(given: ArrayLike, what: str, last: int | None = None, below: float = 0) -> Array:
+    """Return an array, whose last axis has a length, of values below a bound, m, unless that is 0.
+
+    Raises `ParameterError` if it is none.
+    """
     try:
         values = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ParameterError(f'{what} must be numbers: {error}') from error
     if last is not None and values.shape[-1:] != (last,):
         raise ParameterError(f'{what} must be (..., {last}), got {values.shape}')
+    if below and not (np.abs(values) < below).all():
+        raise ParameterError(f'{what} must be finite and below {below:g} m: are they in mm?')
     return values

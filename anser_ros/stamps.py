@@ -79,19 +79,12 @@ EPOCHS = {
 """Where other programs begin to count seconds, s, by the usual zero of 1970."""
 RECENT_NS = 946_684_800 * SECOND_NS
 """Start of the year 2000, ns: a recording's stamps are not before."""
-
-
-EPOCHS_OF_DAYS = {
-    '1899-12-30 (Excel)': -2_209_161_600, 'the year 0 (MATLAB)': -62_167_305_600,
-}  # fmt: skip
-"""Where programs begin that count days; Excel's year 1900 has a day too many."""
+EPOCHS_OF_DAYS = {'1899-12-30 (Excel)': -2_209_161_600, 'year 0 (MATLAB)': -62_167_305_600}
+"""Where programs begin that count days, s."""
 
 
 def stamp_fault(first_ns: int, last_ns: int, of_days: bool = False) -> str:
-    """Return why times, ns, cannot be stamps, and what mends it; empty where they can.
-
-    ``of_days``: whether they were counted in days.
-    """
+    """Return why times, ns, or ``of_days``, are no stamps, and the remedy; empty if they are."""
     if first_ns >= 0 and last_ns <= LATEST_NS:
         return ''
     if first_ns < 0:

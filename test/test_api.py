@@ -149,8 +149,11 @@ class TestWriteSession:
         write_session(path, SETUP, times, flux)
         with pytest.raises(BagError, match='already exists'):
             write_session(path, SETUP, times, flux)
-        write_session(path, SETUP, times[:2], flux[:2], overwrite=True)
+        write_session(path, SETUP, 9 * times[:2], flux[:2], overwrite=True)
         assert load_session(path).tools[0].time.size == 2
+        write_session(tmp_path / 'b.mcap', SETUP, times, flux)
+        with pytest.raises(BagError, match='several sessions, of other boards or at the same'):
+            load_session(tmp_path)
 
 
 def test_what_is_none_is_refused(tmp_path):

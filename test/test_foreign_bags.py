@@ -59,12 +59,12 @@ def test_joined_files_are_read_one_after_the_other(tmp_path):
     rows = [pose(k) for k in range(COUNT)]
     first = mcap(tmp_path / 'a.mcap', rows[:100]).read_bytes()
     second = mcap(tmp_path / 'b.mcap', rows[100:]).read_bytes()
-    both = tmp_path / 'both.mcap'
+    both = tmp_path / 'both.MCAP'
     for parts, count in (((first, second), COUNT), ((first, first, first), 3 * 100)):
         both.write_bytes(b''.join(parts))
         salvage = Salvage()
         assert len(list(iter_messages(both, salvage))) == count
-        assert f'{len(parts)} files are joined in both.mcap' in salvage.lost
+        assert f'{len(parts)} files are joined in both.MCAP' in salvage.lost
     both.write_bytes(first[:-20] + second)
     assert 'breaks off' not in read(both)[1] and '2 files are joined' in read(both)[1]
     both.write_bytes(first[: len(first) // 3] + second)
@@ -210,6 +210,7 @@ class TestFolders:
         poses, lost = read(bag)
         assert poses.stamp_ns.tolist() == [START + k * 20_000_000 for k in range(COUNT)]
         assert ('metadata.yaml cannot be read' in lost) == (text not in (None, 'whole'))
+        assert ('3 files are joined without metadata.yaml' in lost) == (text is None)
 
     @pytest.mark.parametrize('damage', ['missing', 'empty', 'cut', 'no bag', 'packed and cut'])
     def test_a_file_that_is_not_whole_costs_no_other(self, bag, damage):

@@ -24,7 +24,7 @@ def session_given(given: SessionSource) -> Session:
 @contextmanager
 def shown(progress: Progress, stage: str) -> Iterator[Callable[..., None] | None]:
     """Yield what is called with a stage in words, a finished share, or both; None for nothing."""
-    if not (progress is None or callable(progress) or isinstance(progress, bool)):
+    if not (callable(progress) or progress in (None, True, False)):
         raise ParameterError(f'progress must be True or a function, got {progress!r}')
     last = ''
 

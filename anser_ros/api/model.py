@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from anser_ros.api.recording import SetupSource, load_setup
 from anser_ros.arrays import numbers_of
 from anser_ros.errors import ParameterError
-from anser_ros.field.model import FieldModel, near_points
+from anser_ros.field.model import FARTHEST_M, FieldModel
 from anser_ros.field.nominal import nominal_model
 from anser_ros.sessions.nominal_board import board_of
 from anser_ros.sessions.starting_model import NOMINAL, load_model, save_model
@@ -127,7 +127,7 @@ class Model:
             When the two shapes differ, or do not end in 3, a position is not finite or not in m,
             or an axis is not a unit vector.
         """
-        points, axes = near_points(position, 'positions'), numbers_of(axis, 'axes')
+        points, axes = numbers_of(position, 'positions', 3, FARTHEST_M), numbers_of(axis, 'axes')
         if points.shape != axes.shape:
             raise ParameterError(
                 f'positions and axes must both be (..., 3), got {points.shape} and {axes.shape}'

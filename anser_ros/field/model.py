@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import Array, ComplexArray, numbers_of
-from anser_ros.errors import ModelFileError, ParameterError
+from anser_ros.errors import ModelFileError
 from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.physics.dipole import dipole_field, flux_basis
 from anser_ros.physics.sensor import along_each_axis
@@ -64,15 +64,6 @@ class Dipoles:
 
 FARTHEST_M = 10.0
 """Coordinate, m, in a board's frame that is meant in mm: a tracked volume is below 1."""
-
-
-def near_points(given: ArrayLike, what: str) -> Array:
-    """Return points (..., 3), m; raises `ParameterError` where they are none near a board."""
-    points = numbers_of(given, what, 3)
-    if not (np.abs(points) < FARTHEST_M).all():
-        raise ParameterError(f'{what} must be finite and below {FARTHEST_M:g} m: are they in mm?')
-    return points
-
 
 OFF_AXIS = 1e-6
 """Moment across the axis, of the whole, and distance, m, up to which a dipole is on the axis."""
@@ -373,9 +364,9 @@ class FieldModel:
     def __call__(self, points: ArrayLike) -> ComplexArray:
         """Return each emitter's field (..., 3, K), T, at points (..., 3), m, both in fg.
 
-        Raises `ParameterError` as `near_points` does.
+        Raises `ParameterError` when the points are of another shape, no numbers or too far.
         """
-        places = near_points(points, 'points')
+        places = numbers_of(points, 'points', 3, FARTHEST_M)
         fields = self.dipoles.field(places.reshape(-1, 3))
         return fields.reshape(*places.shape, len(self.emitters))
 

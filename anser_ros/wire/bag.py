@@ -7,7 +7,7 @@ without. What is lost of what the description counts is stated too.
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -208,11 +208,11 @@ def read_bag(path: str | os.PathLike[str]) -> recorded.Bag:
         collector.add(raw)
     if not collector.setups:
         raise BagError(f'{os.fspath(path)}: the bag has no setup; anser import --setup adds one')
-    if Path(path).is_dir() and not Path(path, 'metadata.yaml').is_file():
-        _check_one_session(os.fspath(path), collector)
     text = collector.setups[-1]  # acquisition adds rate and noise once its stream is there
     try:
         setup = parse_setup(text)
+        if Path(path).is_dir() and not Path(path, 'metadata.yaml').is_file():
+            _check_one_session(os.fspath(path), collector)
     except SetupError as error:
         raise BagError(f'{os.fspath(path)}: {error}') from error
     tool, reference = collector.flux_stream('tool'), collector.flux_stream('reference')
@@ -227,18 +227,17 @@ def read_bag(path: str | os.PathLike[str]) -> recorded.Bag:
 
 
 def _check_one_session(path: str, found: _Collector) -> None:
-    """Refuse a folder of several sessions: of other boards, or fluxes twice at the same time."""
-    with suppress(SetupError):  # which is said of the last
-        first, *others = (parse_setup(text) for text in dict.fromkeys(found.setups))
-        if any((s.emitter, s.sensors) != (first.emitter, first.sensors) for s in others):
-            raise BagError(f'{path}: sessions of several boards or sensors; read them one by one')
-    for which, fluxes in found.flux.items():
+    """Refuse a folder of sessions of several boards, or with fluxes twice at the same time."""
+    first, *others = (parse_setup(text) for text in dict.fromkeys(found.setups))
+    is_one = all((s.emitter, s.sensors) == (first.emitter, first.sensors) for s in others)
+    for fluxes in found.flux.values():
         stamps = np.array([stamp for stamp, _ in fluxes], dtype=np.int64)
-        falls = np.flatnonzero(np.diff(stamps) < -JUMP_NS) + 1
-        spans = sorted((run.min(), run.max()) for run in np.split(stamps, falls) if run.size)
-        if any(after[0] < before[1] for before, after in pairwise(spans)):
-            words = f'several sessions, as {which}/flux has times twice; read them one by one'
-            raise BagError(f'{path}: {words}')
+        runs = np.split(stamps, np.flatnonzero(np.diff(stamps) < -JUMP_NS) + 1)
+        spans = sorted((run.min(), run.max()) for run in runs if run.size)
+        is_one &= all(before[1] <= after[0] for before, after in pairwise(spans))
+    if not is_one:
+        words = 'several sessions, of other boards or at the same time'
+        raise BagError(f'{path}: {words}; read them one by one')
 
 
 def read_fluxes(path: str | os.PathLike[str]) -> dict[str, recorded.RecordedFluxes]:

@@ -199,8 +199,7 @@ def files_of(path: Path, salvage: Salvage) -> tuple[list[Path], int]:
     except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError, AttributeError):
         salvage.add('metadata.yaml cannot be read, and its files are taken by name')
     if len(names) > 1 and not described.is_file():
-        joined = ', '.join(names)
-        salvage.add(f'{len(names)} files that no metadata.yaml joins are read as one: {joined}')
+        salvage.add(f'{len(names)} files are joined without metadata.yaml: {", ".join(names)}')
     files = []
     for name in names:
         near = [f for f in there if f.name.removesuffix(ZSTD) == name.removesuffix(ZSTD)]

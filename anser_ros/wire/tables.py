@@ -127,41 +127,35 @@ def _nanoseconds(words: Any, what: str) -> Integers:
 
 
 def check_rising(path: str | os.PathLike[str], time: Array, lines: Sequence[int]) -> None:
-    """Refuse times (n,), s, that fall back to where they began, with the line in the file.
+    """Refuse times (n,), s, that fall back to where they began; ``lines`` in the file (n,).
 
-    Sorted, such rows would stand before or among the others, with a gap that never was. Less than
-    a second is a matter of order. Raises `ParameterError`.
+    Sorted, they would make a gap that never was. Raises `ParameterError`.
     """
     known = np.flatnonzero(np.isfinite(time))
     steps = np.diff(time[known], append=np.inf)[:-1]
     row, most = (int(np.argmin(steps)), steps.max()) if steps.size else (0, 0.0)
     is_back = steps.size and time[known[row + 1]] <= time[known[0]] + most
-    if is_back and -steps[row] > max(most, 1.0):
+    if is_back and -steps[row] > max(most, 1.0):  # less than a second is a matter of order
         raise ParameterError(
-            f'{os.fspath(path)}: line {lines[known[row + 1]]}: the time falls by '
-            f'{-steps[row]:.4g} s, more than it ever rises: a counter that wrapped, or a second '
-            'recording? Let it go on, or give each recording its own file'
+            f'{path}: line {lines[known[row + 1]]}: the time falls by {-steps[row]:.4g} s, more '
+            'than it ever rises: a counter that wrapped, or a second recording? Let it go on, or '
+            'give each recording its own file'
         )
 
 
-Span = tuple[str, str, float, float]
+Span = tuple[str, str | os.PathLike[str], float, float]
 """Name of a sensor, file, first and last time, s."""
 
 
 def check_apart(seen: list[Span], name: str, path: str | os.PathLike[str], time: Array) -> None:
-    """Refuse times (n,), s, among those that another file gives of the sensor of this name.
-
-    ``seen``: what other files gave, to which this is added. Raises `ParameterError`.
-    """
+    """Refuse times (n,), s, of a sensor among those of another file; else add them to ``seen``."""
     known = time[np.isfinite(time)]
-    if not known.size:
-        return
-    first, last = float(known.min()), float(known.max())
+    first, last = known.min(initial=np.inf), known.max(initial=-np.inf)
     for other, file, begin, end in seen:
         if other == name and max(first, begin) < min(last, end):
-            words = f'{file} and {os.fspath(path)} both give {name}, at the same times'
+            words = f'{file} and {path} both give {name}, at the same times'
             raise ParameterError(f'{words}: give one of them another name, or import it alone')
-    seen.append((name, os.fspath(path), first, last))
+    seen.append((name, path, first, last))
 
 
 def read_table(path: str | os.PathLike[str], *, as_text: bool = False) -> Table:

@@ -62,6 +62,8 @@ def test_tool_tracker_counts_field_periods_and_says_what_is_missing(tmp_path):
     np.testing.assert_allclose(one.rotation[0], TURN.as_matrix(), atol=1e-12)
     assert other.size == 1
     np.testing.assert_allclose(other.missing, [0.025, 0.05])
+    session = import_poses([tool_tracker(tmp_path / 'b.tsv', [(cell(8),), (cell(16),)], ('',))])
+    assert 'port_1: no time; 320 frames a second are assumed' in session.lost
 
 
 def test_a_file_called_optical_alone_is_a_tracker(tmp_path):
