@@ -105,7 +105,7 @@ class TestTrack:
 
 class TestFollow:
     def test_what_is_missing_is_said(self, metal, model, factory):
-        with pytest.raises(BagError, match='--baseline'):
+        with pytest.raises(BagError, match='a refit needs a baseline'):
             ModelFollower(prepare(metal, model))
         blind = replace(metal, reference=None)
         assert prepare(blind, model, factory).baseline is None

@@ -46,6 +46,8 @@ OTHER = {
 }  # fmt: skip
 """Another value of everything that may be stated."""
 OPTICAL = ('optical_position_m', 'optical_rotation_rad')
+TRACKED = [name for name in VALUES if name != OPTICAL[1]]
+"""What has an effect on an evaluation, which compares places and directions alone."""
 
 
 def setup_with(**sections):
@@ -229,7 +231,7 @@ class TestEffect:
 class TestCommands:
     @pytest.mark.parametrize(
         ('name', 'used'),
-        [('evaluate', VALUES), ('diagnose', VALUES), ('calibrate', SECTIONS['accuracy'])],
+        [('evaluate', TRACKED), ('diagnose', VALUES), ('calibrate', SECTIONS['accuracy'])],
     )
     def test_the_session_has_what_is_stated(self, name, used, monkeypatch, tmp_path):
         module = {'evaluate': evaluate, 'diagnose': diagnose, 'calibrate': calibrate}[name]

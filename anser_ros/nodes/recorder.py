@@ -440,8 +440,7 @@ class Recorder(AnserNode):
                 log, count = self._logs[topic], self.count_publishers(topic)
                 log.n_publishers = max(log.n_publishers, count)
                 if self._counts.get(topic) != count:
-                    self._counts[topic] = count
-                    self._match(topic)
+                    self._counts[topic] = self._match(topic)
             elif self._wanted(topic) and len(type_names) == 1:
                 added = self._add(topic, type_names[0]) or added
         if added and self._bag is not None:
@@ -505,8 +504,10 @@ class Recorder(AnserNode):
         if message.topic.name == '/diagnostics':
             self._look(message.data)
 
-    def _match(self, topic: str) -> None:
-        """Subscribe anew where a publisher has come that the subscription does not match."""
+    def _match(self, topic: str) -> int:
+        """Subscribe anew where a publisher has come that the subscription does not match; return
+        how many publishers were asked: the graph may count one before it states what it offers.
+        """
         known = self._topic_subscriptions[topic]
         offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
         if known is not None and offered:
@@ -514,6 +515,7 @@ class Recorder(AnserNode):
             if wanted.reliability > had.reliability or wanted.durability > had.durability:
                 self.destroy_subscription(known)
                 self._topic_subscriptions[topic] = self._subscribe[topic](qos_profile=wanted)
+        return len(offered)
 
     def _new_folder(self, name: str) -> Path:
         parent = Path(self.parameters.directory).expanduser()
