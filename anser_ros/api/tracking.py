@@ -109,7 +109,7 @@ class TrackingResult(Mapping[str, TrackedPoses]):
         return iter({**self.bodies, **self.sensors})
 
     def __len__(self) -> int:
-        return len(list(iter(self)))
+        return len({**self.bodies, **self.sensors})
 
     def __repr__(self) -> str:
         return f'TrackingResult({", ".join(map(repr, (self[name] for name in self)))})'
