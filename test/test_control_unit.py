@@ -51,16 +51,18 @@ def codes_of(unit, samples):
     return np.concatenate([p.codes for p in payloads if isinstance(p, frames.SampleBlock)])
 
 
+def stream_of(unit, rate_hz=1 / WINDOW_S):
+    """Return a stream for a unit."""
+    said = decode(unit.receive(frames.encode(frames.Identify())))
+    (hello,) = [p for p in said if isinstance(p, frames.Hello)]
+    return FluxStream(hello, SETUP, CHANNELS, WINDOW_S, rate_hz)
+
+
 def fluxes(unit, seconds=0.1):
     """Fluxes (windows, S, K), their sigmas and the mid times, as acquisition makes them."""
     unit.receive(frames.encode(frames.Start()))
     begin, arrival_ns, found = unit.samples / unit.sample_rate_hz, 10**12, []
-    (hello,) = [
-        p
-        for p in decode(unit.receive(frames.encode(frames.Identify())))
-        if isinstance(p, frames.Hello)
-    ]
-    stream = FluxStream(hello, SETUP, CHANNELS, WINDOW_S, 1 / WINDOW_S)
+    stream = stream_of(unit)
     stream.restart(arrival_ns)
     for _ in range(round(seconds / 0.005)):
         for block in decode(unit.advance(200)):
@@ -70,6 +72,30 @@ def fluxes(unit, seconds=0.1):
     flux = [np.concatenate([frame.tool.flux, frame.reference.flux]) for frame in found]
     times = begin + (np.arange(len(found)) + 0.5) * WINDOW_S
     return np.array(flux), np.array([frame.window.sigma for frame in found]), times
+
+
+@pytest.mark.parametrize('rate_hz', [25, 50, 100])
+def test_blocks_in_runs_lost_and_twice_give_the_fluxes_of_single_blocks(rate_hz):
+    unit = ControlUnit(world(), CHANNELS)
+    payloads = [r.payload for r in FrameReader().feed(streamed(unit, 12_000))]
+    blocks = [p for p in payloads if isinstance(p, frames.SampleBlock)]
+    kept = [b for b in blocks if b.sequence not in {50, 97, 98, *range(150, 175)}]
+    kept.insert(60, kept[55])
+    rng, found = np.random.default_rng(rate_hz), []
+    for runs in (False, True):
+        stream, done, times = stream_of(unit, rate_hz), 0, []
+        stream.restart(10**12)
+        while done < len(kept):
+            count = stream.run_length(kept[done : done + rng.integers(1, 9)]) if runs else 1
+            arrivals = [10**12 + (b.sequence + 1) * 10**6 for b in kept[done : done + count]]
+            times += stream.push(kept[done : done + count], arrivals)
+            done += count
+        found.append(times)
+    single, grouped = ([(f.window.flux, f.flags) for f in times] for times in found)
+    assert len(single) > 0.8 * 0.3 * rate_hz
+    for (flux, flags), (same, same_flags) in zip(single, grouped, strict=True):
+        np.testing.assert_allclose(same, flux, rtol=1e-9, atol=1e-15)
+        assert np.array_equal(same_flags, flags)
 
 
 class TestProtocol:

@@ -110,6 +110,21 @@ def test_lost_samples_are_left_out_of_the_fit():
     assert np.abs(fit.phasors - truth).max() < 1e-6
 
 
+def test_a_fit_that_began_early_is_that_of_the_whole_window():
+    rng = np.random.default_rng(5)
+    samples = waves(phasors(), 800) + rng.normal(0, 3, (800, len(phasors())))
+    demodulator = Demodulator(RATE, TONES, 800)
+    whole = demodulator.demodulate(samples)
+    for count in (1, 640, 800):
+        fit = demodulator.demodulate(samples, begun=demodulator.begin(samples[:count]))
+        for name in ('phasors', 'sigma', 'noise', 'rates'):
+            np.testing.assert_allclose(getattr(fit, name), getattr(whole, name), rtol=1e-7)
+    present = np.ones(800, bool)
+    present[700:720] = False
+    lossy = demodulator.demodulate(samples, present, demodulator.begin(samples[:640]))
+    assert np.array_equal(lossy.phasors, demodulator.demodulate(samples, present).phasors)
+
+
 def test_too_few_samples_and_tones_too_close_are_refused():
     present = np.zeros(800, bool)
     present[:30] = True

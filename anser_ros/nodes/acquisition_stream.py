@@ -19,7 +19,13 @@ from anser_ros.errors import FitError, SetupError
 from anser_ros.nodes.streams.clouds import FLUX_NOISE, STAMP_SIGMA
 from anser_ros.settings import Accuracy
 from anser_ros.signals.clock import SampleClock
-from anser_ros.signals.demodulation import Demodulator, FluxConverter, FluxRates, FluxWindow
+from anser_ros.signals.demodulation import (
+    BegunFit,
+    Demodulator,
+    FluxConverter,
+    FluxRates,
+    FluxWindow,
+)
 from anser_ros.signals.repetition import RepetitionWatch
 from anser_ros.signals.window import TickCheck, Window, WindowCutter
 from anser_ros.wire.channel_calibration import ChannelCalibration
@@ -113,6 +119,8 @@ class FluxStream:
         self._rates = None if self._demodulator.follows_motion else FluxRates()
         self._watch = RepetitionWatch(len(hello.channels), rate, self.tones_hz)
         self._repeats = False
+        # What is known of the next window before it is complete, and its middle in samples
+        self._begun: tuple[float, BegunFit] | None = None
         self.ticks = TickCheck(rate, hello.tick_hz)
         self._cutter = WindowCutter(window, hop, self._watch, self.ticks)
         self.counters = self._cutter.counters
@@ -178,11 +186,12 @@ class FluxStream:
         codes = np.concatenate([b.codes for b in blocks]) if len(blocks) > 1 else first.codes
         ticks = [block.timestamp_ticks for block in blocks]
         windows = self._cutter.push(first.sequence, ticks, codes)
-        if not windows:
-            self._watch.search()  # while the rest of the window is still to come
         self._repeats = self._watch.repeats
         if self.counters.restarts != restarts:
             self._end_stream()
+        if not windows:  # the rest of the window is still to come
+            self._watch.search()
+            self._begin()
         # What comes twice says nothing about now, and of blocks read together the newest says all.
         newest = self._cutter.end_sample
         for left in range(len(blocks) - 1, 0, -1):
@@ -225,6 +234,7 @@ class FluxStream:
         """Withhold all that wait, whose samples belong to a stream that has ended."""
         self.withheld += len(self._waiting)
         self._waiting.clear()
+        self._begun = None
         self.clock.restart()
 
     def _converter_of(self, hello: Hello, calibration: ChannelCalibration) -> FluxConverter:
@@ -242,8 +252,18 @@ class FluxStream:
             current_delay_s=calibration.current_delay_s,
         )
 
+    def _begin(self) -> None:
+        """Begin to demodulate the next window, once, when little of it is still to come."""
+        cutter, begun = self._cutter, self._begun
+        middle = cutter.end_sample + cutter.samples_wanted - cutter.window / 2
+        is_near = cutter.samples_wanted <= LAST_S * self._sample_rate_hz
+        if is_near and (begun is None or begun[0] != middle):
+            self._begun = middle, self._demodulator.begin(cutter.coming())
+
     def _frame(self, window: Window) -> FluxFrame:
-        fit = self._demodulator.demodulate(window.codes, window.present)
+        middle, begun = self._begun or (0.0, None)
+        begun = begun if middle == window.middle_sample else None
+        fit = self._demodulator.demodulate(window.codes, window.present, begun)
         rates, middle_s = self._rates, window.middle_sample / self._sample_rate_hz
         converted = self._converter.convert(fit, None if rates is None else rates.at(middle_s))
         if rates is not None:

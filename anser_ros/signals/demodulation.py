@@ -74,6 +74,15 @@ class _Solution:
     variance: Array
 
 
+@dataclass(frozen=True)
+class BegunFit:
+    """Holds what a fit needs of the first ``count`` samples of a window, for C channels."""
+
+    count: int
+    projected: Array  # (R, C), on the R columns of the basis
+    energy: Array  # (C,), sum of squares
+
+
 class Demodulator:
     """Demodulates windows of a fixed length, with drive tones (K,), by least squares.
 
@@ -121,24 +130,28 @@ class Demodulator:
             ) from failure
         self._bias = self._motion_bias(self._solution, self._design, self._times_s)
 
-    def demodulate(self, samples: AnyArray, present: Booleans | None = None) -> ToneFit:
+    def begin(self, samples: AnyArray) -> BegunFit:
+        """Fit what is there of a window, its first samples (n, C), before the rest comes."""
+        return _projected(self._solution, samples)
+
+    def demodulate(
+        self, samples: AnyArray, present: Booleans | None = None, begun: BegunFit | None = None
+    ) -> ToneFit:
         """Fit the phasors of all tones of all channels to a window's samples (N, C).
 
-        Samples that are not ``present`` (N,) were lost, and their values are ignored. Raises
-        `FitError` when the samples that are left do not determine the tones.
+        Samples that are not ``present`` (N,) were lost, and their values are ignored; the fit goes
+        on from what was ``begun`` with the same samples where none was lost. Raises `FitError`
+        when the samples that are left do not determine the tones.
         """
         solution, bias = self._solution, self._bias
-        values = samples.astype(np.float64)
         if present is not None and not present.all():
             solution = _solve(self._design[present], 2 * self.frequencies_hz.size)
-            values = values[present]
+            samples, begun = samples[present], None
             bias = self._motion_bias(solution, self._design[present], self._times_s[present])
-        projected = solution.basis.T @ values
-        coefficients = solution.to_coefficients @ projected
-        energy = np.einsum('nc,nc->c', values, values) - np.einsum(
-            'rc,rc->c', projected, projected
-        )
-        freedom = max(values.shape[0] - solution.basis.shape[1], 1)
+        whole = _projected(solution, samples, begun)
+        coefficients = solution.to_coefficients @ whole.projected
+        energy = whole.energy - np.einsum('rc,rc->c', whole.projected, whole.projected)
+        freedom = max(whole.count - solution.basis.shape[1], 1)
         noise = np.sqrt(np.maximum(energy, 0.0) / freedom)
         count = self.frequencies_hz.size
         phasors = (coefficients[:count] + 1j * coefficients[count : 2 * count]).T
@@ -157,6 +170,17 @@ class Demodulator:
         count = 2 * self.frequencies_hz.size
         projected = solution.basis.T @ (times_s[:, None] * design[:, :count])
         return np.asarray((solution.to_coefficients @ projected)[:count])
+
+
+def _projected(solution: _Solution, samples: AnyArray, begun: BegunFit | None = None) -> BegunFit:
+    """Take in the samples (n, C) of a window's beginning that were not ``begun`` with."""
+    done = 0 if begun is None else begun.count
+    values = samples[done:].astype(np.float64)
+    projected = solution.basis[done : len(samples)].T @ values
+    energy = np.einsum('nc,nc->c', values, values)
+    if begun is not None:
+        projected, energy = projected + begun.projected, energy + begun.energy
+    return BegunFit(len(samples), projected, energy)
 
 
 def _kept_harmonics(

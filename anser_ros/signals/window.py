@@ -157,10 +157,10 @@ class WindowCutter:
 
     A hop, the way from one window to the next, leaves samples out if it is longer than the window.
 
-    ``end_sample`` is the number of the sample behind the newest block, since the device began to
-    count, ``expected`` the number of the block that follows on it (None: any); ``samples_wanted``
-    is how many the next window still lacks. Raises `ParameterError` when a length is less than one
-    sample.
+    ``window`` is the length of one, samples, ``end_sample`` the number of the sample behind the
+    newest block, since the device began to count, ``expected`` the number of the block that
+    follows on it (None: any); ``samples_wanted`` is how many the next window still lacks. Raises
+    `ParameterError` when a length is less than one sample.
     """
 
     def __init__(
@@ -173,7 +173,7 @@ class WindowCutter:
             )
         self.counters = CutterCounters()
         self.columns = watch.columns
-        self._window = window_samples
+        self.window = window_samples
         self._hop = hop_samples
         self._watch, self._ticks = watch, ticks
         self._codes = np.zeros((max(4 * window_samples, 8192), watch.columns), np.int16)
@@ -183,11 +183,16 @@ class WindowCutter:
     def reset(self) -> None:
         """Forget the samples; the next block begins a new grid of windows."""
         self._filled = 0
-        self.samples_wanted = self._window
+        self.samples_wanted = self.window
         self.expected: int | None = None
         self.end_sample = self._begin_sample = 0
         self._watch.reset()
         self._ticks.reset()
+
+    def coming(self) -> NDArray[np.int16]:
+        """Return the samples (n, C) that are there of the next window, lost ones included."""
+        count = max(self.window - self.samples_wanted, 0)
+        return self._codes[self._filled - count : self._filled]
 
     def push(
         self, sequence: int, timestamp_ticks: int | Sequence[int], codes: NDArray[np.int16]
@@ -219,7 +224,7 @@ class WindowCutter:
             self._watch.skip(missing)
             self._ticks.begin(first, ticks[0])
             # Windows that lie inside a long hole are not cut.
-            hops = max((missing - 2 * self._window) // self._hop, 0)
+            hops = max((missing - 2 * self.window) // self._hop, 0)
             self.counters.windows_lost += hops
             left = missing - hops * self._hop
             windows += self._advance(None, left, first - left)
@@ -261,7 +266,7 @@ class WindowCutter:
 
     def _append(self, codes: NDArray[np.int16] | None, count: int) -> None:
         if self._filled + count > len(self._codes):
-            keep = min(self._filled, self._window)
+            keep = min(self._filled, self.window)
             tail = slice(self._filled - keep, self._filled)
             self._codes[:keep] = self._codes[tail].copy()
             self._present[:keep] = self._present[tail].copy()
@@ -274,22 +279,22 @@ class WindowCutter:
 
     def _cut(self, end: int) -> list[Window]:
         """Return the window that ends with the newest sample, unless too little of it arrived."""
-        place = slice(self._filled - self._window, self._filled)
+        place = slice(self._filled - self.window, self._filled)
         codes, present = self._codes[place].copy(), self._present[place].copy()
         arrived = int(np.count_nonzero(present))
-        if 2 * arrived < self._window:
+        if 2 * arrived < self.window:
             self.counters.windows_lost += 1
             return []
         self.counters.windows += 1
-        seen = codes if arrived == self._window else codes[present]
-        if arrived < self._window:
+        seen = codes if arrived == self.window else codes[present]
+        if arrived < self.window:
             self.counters.windows_dropped_samples += 1
         low, high = seen.min(axis=0), seen.max(axis=0)
         saturated = (low <= RAILS[0]) | (high >= RAILS[1])
-        watch, first = self._watch, end - self._window - self._begin_sample
+        watch, first = self._watch, end - self.window - self._begin_sample
         return [
             Window(
-                codes, present, end - self._window / 2, saturated, low == high,
+                codes, present, end - self.window / 2, saturated, low == high,
                 watch.ages(first), watch.noiseless, watch.repeats,
             )
         ]  # fmt: skip

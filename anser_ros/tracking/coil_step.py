@@ -82,7 +82,7 @@ class Followed(NamedTuple):
     residual: Array  # (S, 2K), T
     found: Array  # (S, 3), chi-square, evaluations, whether it converged
     covariance: Array  # (S, 6, 6)
-    figures: Array  # (S, 2), sigma of the position, m, and rms of the residual, T
+    residual_t: Array  # (S,), rms of the residual, T
 
     @classmethod
     def empty(cls, count: int, width: int) -> 'Followed':
@@ -90,7 +90,7 @@ class Followed(NamedTuple):
         return cls(
             np.full(count, UNKNOWN), np.empty((count, 3)), np.empty((count, 3)),
             np.empty((count, 6, 6)), np.empty((count, width)), np.empty((count, 3)),
-            np.empty((count, 6, 6)), np.empty((count, 2)),
+            np.empty((count, 6, 6)), np.empty(count),
         )  # fmt: skip
 
     def solution(self, i: int) -> CoilSolution:
@@ -198,7 +198,7 @@ def _judge_coil(s, memory, model, rules, out):  # type: ignore[no-untyped-def]
     sigma_m = math.sqrt(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
     for value in out.residual[s]:
         power += value * value
-    out.figures[s, 0], out.figures[s, 1] = sigma_m, math.sqrt(power / out.residual.shape[1])
+    out.residual_t[s] = math.sqrt(power / out.residual.shape[1])
     is_inside = True
     for i in range(3):
         is_inside &= rules.low[i] <= position[i] <= rules.high[i]

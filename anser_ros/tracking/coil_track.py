@@ -57,6 +57,7 @@ class CoilTracks:
     def __init__(self, count: int) -> None:
         self.scans = [Scans() for _ in range(count)]
         self._made_for: tuple[ErrorModes | None, Array] | None = None
+        self._ruled: tuple[TrackerSettings, int, coil_step.Rules] | None = None
         noise = np.tile(FRESH_NOISE, (count, 1))
         self.noise = [NoiseScale(row) for row in noise]
         some, none = np.zeros((count, 6)), np.empty((count, 0, 0))
@@ -105,10 +106,12 @@ class CoilTracks:
     ) -> coil_step.Followed:
         """Solve all coils near where they are expected; see `follow_coils`."""
         out, memory = coil_step.Followed.empty(*values.shape), self.prepare(context)
+        ruled, width = self._ruled, values.shape[1]
+        if ruled is None or ruled[0] is not settings or ruled[1] != width:
+            ruled = self._ruled = settings, width, coil_step.rules_of(settings, width)
         if context.readings >= coil_step.UNKNOWNS and not coil_step.follow_coils(
-            stamp_ns, values, sound, lengths, memory, context.arrays,
-            coil_step.rules_of(settings, values.shape[1]), out,
-        ):  # fmt: skip
+            stamp_ns, values, sound, lengths, memory, context.arrays, ruled[2], out
+        ):
             raise TrackingError(NOT_FINITE)
         return out
 
@@ -163,11 +166,10 @@ def track_coil(frame: CoilFrame, followed: coil_step.Followed) -> CoilResult:
     if fault == SOUND:
         scans.forget()
         solution = followed.solution(row)
-        sigma_m, residual_t = followed.figures[row].tolist()
         estimate = PoseEstimate(
             frame.name, frame.stamp_ns, states.OK, solution.position, solution.axis, None,
-            followed.covariance[row], sigma_m, residual_t, solution.chi2 / frame.freedom,
-            context.model_id,
+            followed.covariance[row], float(followed.residual_t[row]),
+            solution.chi2 / frame.freedom, context.model_id,
         )  # fmt: skip
         return CoilResult(estimate, solution, False, frame.among_metal)
     if fault != coil_step.UNKNOWN:

@@ -132,23 +132,21 @@ class PoseEstimate:
     # (6, 6), position (m^2) and rotation vector (rad^2), both in fg; the model's uncertainty
     # included
     covariance: Array
-    sigma_position_m: float  # Square root of the trace of the position covariance
     residual_t: float  # Root mean square of measured minus modelled flux components, T
     chi2: float  # Residual power per degree of freedom in units of the expected one
     model_id: str  # Which field model made it
     reason: str = ''  # Why the state is not ``ok``, in words with figures
 
-    def with_sigma(self, sigma_position_m: float) -> 'PoseEstimate':
-        """Return the same estimate with another sigma of the position."""
-        other = PoseEstimate.__new__(PoseEstimate)  # in a sixth of the time of `replace`
-        other.__dict__.update(self.__dict__, sigma_position_m=sigma_position_m)
-        return other
+    @property
+    def sigma_position_m(self) -> float:
+        """Return the square root of the trace of the position's covariance."""
+        matrix = self.covariance
+        return math.sqrt(matrix[0, 0] + matrix[1, 1] + matrix[2, 2])
 
-    def with_shift(self, sigma_m: float) -> 'PoseEstimate':
-        """Return the estimate with a shift, m along each axis, in its sigma and covariance."""
-        for i in range(3):  # the estimate's own matrix is not used elsewhere
+    def add_shift(self, sigma_m: float) -> None:
+        """Add a shift, m along each axis, to the covariance, a matrix that is no other's."""
+        for i in range(3):
             self.covariance[i, i] += sigma_m**2
-        return self.with_sigma(math.sqrt(self.sigma_position_m**2 + 3.0 * sigma_m**2))
 
 
 def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) -> PoseEstimate:
@@ -156,7 +154,7 @@ def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) ->
     nothing = np.full(3, np.nan)
     return PoseEstimate(
         name, stamp_ns, state, nothing, nothing, None, np.full((6, 6), np.nan), math.nan,
-        math.nan, math.nan, model_id, reason,
+        math.nan, model_id, reason,
     )  # fmt: skip
 
 
@@ -255,10 +253,4 @@ class Tip:
         carry[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
         covariance = carry @ body.covariance @ carry.T
         covariance[:3, :3] += body.rotation @ self.covariance @ body.rotation.T
-        return replace(
-            body,
-            name=self.name,
-            position=body.position + arm,
-            covariance=covariance,
-            sigma_position_m=math.sqrt(float(np.trace(covariance[:3, :3]))),
-        )
+        return replace(body, name=self.name, position=body.position + arm, covariance=covariance)

@@ -27,7 +27,7 @@ from anser_ros.tracking.body_track import BodyResult
 from anser_ros.tracking.coil_track import CoilResult
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
 from anser_ros.tracking.rigid import BodyCoils
-from anser_ros.tracking.solve import add_motion, coil_covariance
+from anser_ros.tracking.solve import add_gain, add_motion
 
 Estimates = list[PoseEstimate]
 
@@ -140,10 +140,15 @@ class Judgement:
         found += of_bodies
         if settings.judges:
             self._add_to_record(stamp_ns, found[: len(coils)])
-            found = [self._judged_in_time(estimate, settings) for estimate in found]
+            tools = settings.tools
+            bounds = MotionBounds(tools.max_speed_m_s, tools.max_acceleration_m_s2)
+            found = [self._judged_in_time(estimate, bounds) for estimate in found]
             for i, body in enumerate(bodies):
                 self._take_alternating(found, [*body.rows.tolist(), len(coils) + i])
-        return [self._with_stamp_error(e, settings) if e.state == states.OK else e for e in found]
+        for estimate in found:
+            if estimate.state == states.OK:
+                self._add_stamp_error(estimate, settings)
+        return found
 
     def _add_to_record(self, stamp_ns: int, coils: Estimates) -> None:
         refused = [math.sqrt(e.chi2) for e in coils if e.state in CONTRADICTS]
@@ -151,15 +156,15 @@ class Judgement:
         typical = sorted(refused)[len(refused) // 2] if refused else math.nan
         self.record.add(stamp_ns, len(refused), total, typical)
 
-    def _judged_in_time(self, estimate: PoseEstimate, settings: TrackerSettings) -> PoseEstimate:
+    def _judged_in_time(self, estimate: PoseEstimate, bounds: MotionBounds) -> PoseEstimate:
         """The estimate, or why it is not given out: its own past, or that of the whole model."""
         place = None
         if estimate.state in (states.OK, states.INCONSISTENT):
             where = estimate.position.tolist()
             place = Place(estimate.stamp_ns, where, estimate.sigma_position_m)
-        continuity = self._continuity.setdefault(estimate.name, Continuity())
-        tools = settings.tools
-        bounds = MotionBounds(tools.max_speed_m_s, tools.max_acceleration_m_s2)
+        continuity = self._continuity.get(estimate.name)
+        if continuity is None:
+            continuity = self._continuity[estimate.name] = Continuity()
         refused = estimate.state in CONTRADICTS
         reason = continuity.judge(estimate.stamp_ns, place, refused, bounds)
         if place is not None and not refused and self.record.is_doubtful:
@@ -178,45 +183,30 @@ class Judgement:
                 if found[row].state == states.OK:
                     found[row] = replace(found[row], state=states.UNCONFIRMED, reason=why)
 
-    def _with_stamp_error(self, estimate: PoseEstimate, settings: TrackerSettings) -> PoseEstimate:
-        """The estimate with what the stamp's error makes of its motion in the covariance."""
+    def _add_stamp_error(self, estimate: PoseEstimate, settings: TrackerSettings) -> None:
+        """Add to the estimate's covariance what the stamp's error makes of its motion."""
         last = self._last.get(estimate.name)
         self._last[estimate.name] = estimate
         if last is None or settings.stamp_sigma_s == 0.0:
-            return estimate
+            return
         seconds = (estimate.stamp_ns - last.stamp_ns) * NANO
         if not 0.0 < seconds <= settings.warm_age_s:
-            return estimate
+            return
         before, after = last.rotation, estimate.rotation
         if before is None or after is None:
             before, after = last.axis[:, None], estimate.axis[:, None]
-        # The estimate's own matrix is not used elsewhere.
-        sigma = add_motion(
+        add_motion(
             estimate.covariance, last.position, estimate.position, before, after,
             settings.stamp_sigma_s / seconds,
         )  # fmt: skip
-        return estimate.with_sigma(sigma)
 
 
 def _add_gain_error(found: Estimates, coils: Sequence[CoilResult], body: RigidBody) -> None:
-    """Add to the coils' covariances, in ``found``, what the gain does that they have in common.
-
-    A coil alone takes a gain for another distance. With the free axis vector n that the normal
-    matrix has, a gain is a change of n along itself.
-    """
-    solved = [(row, coils[row].solution) for row in body.rows.tolist()]
-    good = [(r, s) for r, s in solved if s is not None and found[r].state == states.OK]
-    if not good:
-        return
-    axes = np.array([solution.axis for _, solution in good])
-    normals = np.array([solution.normal for _, solution in good])
-    pulls = np.einsum('sij,sj->si', normals[:, :, 3:], axes)
-    pulls[:, 3:] = np.cross(axes, pulls[:, 3:])
-    for (row, solution), pull in zip(good, pulls, strict=True):
-        one, own = found[row], coil_covariance(solution.normal, solution.axis, 0.0)
-        moved = body.result.gain * (own @ pull)
-        one.covariance[:] += np.outer(moved, moved)  # the estimate's own matrix
-        found[row] = one.with_sigma(math.sqrt(float(np.trace(one.covariance[:3, :3]))))
+    """Add to the coils' covariances, in ``found``, what the gain does that they have in common."""
+    for row in body.rows.tolist():
+        solution = coils[row].solution
+        if solution is not None and found[row].state == states.OK:
+            add_gain(found[row].covariance, solution.normal, solution.axis, body.result.gain)
 
 
 def _judged_by_coils(found: Estimates, body: RigidBody, settings: TrackerSettings) -> PoseEstimate:

@@ -222,12 +222,33 @@ def coil_covariance(normal, axis, roll_variance):  # type: ignore[no-untyped-def
 
 
 @kernel
+def add_gain(covariance, normal, axis, gain):  # type: ignore[no-untyped-def]
+    """Add to a coil's covariance (6, 6), in place, what a gain of one deviation ``gain`` does.
+
+    A coil alone takes a gain for another distance. With the free axis vector n that the normal
+    matrix has, see `coil_covariance`, a gain is a change of n along itself.
+    """
+    own, pull, moved = coil_covariance(normal, axis, 0.0), np.zeros(6), np.zeros(6)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for c in range(3):
+            pull[i] += normal[i, 3 + c] * axis[c]
+            pull[3 + i] += axis[j] * normal[3 + k, 3 + c] * axis[c]
+            pull[3 + i] -= axis[k] * normal[3 + j, 3 + c] * axis[c]
+    for i in range(6):
+        for j in range(6):
+            moved[i] += gain * own[i, j] * pull[j]
+    for i in range(6):
+        for j in range(6):
+            covariance[i, j] += moved[i] * moved[j]
+
+
+@kernel
 def add_motion(covariance, position, next_position, axes, next_axes, share):  # type: ignore[no-untyped-def]
     """Add to a pose's covariance (6, 6), in place, a part of its last motion as an error.
 
     ``axes`` and ``next_axes`` hold all axes of a body, or that of a coil, in columns: (3, 3) or
-    (3, 1). ``share`` is the error's standard deviation in units of the motion. Returns the square
-    root of the trace of the position's covariance, m.
+    (3, 1). ``share`` is the error's standard deviation in units of the motion.
     """
     move = np.zeros(6)
     # Each axis n turns by w x n; the sum of n x (w x n) over three axes is 2 w, over one it is w.
@@ -241,4 +262,3 @@ def add_motion(covariance, position, next_position, axes, next_axes, share):  # 
     for i in range(6):
         for j in range(6):
             covariance[i, j] += move[i] * move[j]
-    return math.sqrt(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])

@@ -145,7 +145,7 @@ class SolveFrame:
             reason = f'{words} would explain the fluxes too' if words else ''
             state = states.AMBIGUOUS if words else states.OK
         return PoseEstimate(
-            self.name, self.stamp_ns, state, *pose, scaled, sigma_m, residual_t, ratio,
+            self.name, self.stamp_ns, state, *pose, scaled, residual_t, ratio,
             self.context.model_id, reason,
         )  # fmt: skip
 

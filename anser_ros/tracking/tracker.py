@@ -312,10 +312,11 @@ class Tracker:
         for observer in self._past.observers:
             observer.observe(frames)
         judged = self._past.judgement.judged(stamp_ns, coils, bodies, self.settings)
-        if context.shift_sigma_m == 0.0:
-            return judged
-        # No judge reckons with it: what all poses share contradicts none of them.
-        return [estimate.with_shift(context.shift_sigma_m) for estimate in judged]
+        if context.shift_sigma_m > 0.0:
+            # No judge reckons with it: what all poses share contradicts none of them.
+            for estimate in judged:
+                estimate.add_shift(context.shift_sigma_m)
+        return judged
 
     def _solved_coils(
         self, stamp_ns: int, values: Array, codes: Integers, context: SolveContext

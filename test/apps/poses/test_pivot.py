@@ -121,7 +121,7 @@ def test_a_tip_moves_as_its_body_does():
     factor = rng.normal(0, 1, (6, 6)) * np.repeat([3e-4, 4e-3], 3)[:, None]
     turn = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()
     body = PoseEstimate(
-        'pen', 7, OK, np.array([0.1, 0.2, 0.3]), turn[:, 2], turn, factor @ factor.T, 1e-3, 1e-9,
+        'pen', 7, OK, np.array([0.1, 0.2, 0.3]), turn[:, 2], turn, factor @ factor.T, 1e-9,
         1.0, 'model',
     )  # fmt: skip
     unknown = np.diag([1e-8, 4e-8, 9e-8])
