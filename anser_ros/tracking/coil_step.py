@@ -113,6 +113,36 @@ def _distance(one, other):  # type: ignore[no-untyped-def]
     return math.sqrt(x * x + y * y + z * z)
 
 
+@inlined
+def _knows_errors(s, position, axis, memory, model):  # type: ignore[no-untyped-def]
+    """Return whether the error that is remembered for coil ``s`` is that at a pose, too."""
+    at = memory.error_at[s]
+    is_near = _distance(position, at[:3]) < memory.reach_m[s]
+    return model.modes.shape[0] == 0 or (is_near and _distance(axis, at[3:]) < ERROR_REACH)
+
+
+@inlined
+def _take_errors_of(coils, positions, axes, lengths, memory, model):  # type: ignore[no-untyped-def]
+    """Remember the model's error for coils (C,) at poses, ``positions`` and ``axes`` (C, 3).
+
+    All are worked out together, for reading the model's modes takes longest.
+    """
+    count, rank, width = coils.shape[0], memory.errors.shape[1], memory.errors.shape[2]
+    errors, whitening = np.empty((count, rank, width)), np.empty((count, width, width))
+    near = np.empty((count, 2))
+    is_finite = fill_model_errors(
+        positions, axes, lengths, model.uncertain, model.spacing, model.modes, model.sigma,
+        errors, whitening, near,
+    )  # fmt: skip
+    for c in range(count):
+        s = coils[c]
+        memory.errors[s], memory.whitening[s] = errors[c], whitening[c]
+        memory.error_at[s, :3], memory.error_at[s, 3:] = positions[c], axes[c]
+        memory.reach_m[s] = ERROR_REACH * near[c, 0] if is_finite else -1.0
+        memory.among[s] = near[c, 1]
+    return is_finite
+
+
 @kernel
 def take_errors(s, position, axis, length, memory, model):  # type: ignore[no-untyped-def]
     """Remember the model's error for coil ``s`` at a pose, unless what is remembered is near.
@@ -120,20 +150,10 @@ def take_errors(s, position, axis, length, memory, model):  # type: ignore[no-un
     ``length`` (1,), m; ``model`` is `SolveContext.arrays`. Returns False where the covariance is
     not finite.
     """
-    at = memory.error_at[s]
-    is_near = _distance(position, at[:3]) < memory.reach_m[s]
-    if model.modes.shape[0] == 0 or (is_near and _distance(axis, at[3:]) < ERROR_REACH):
+    if _knows_errors(s, position, axis, memory, model):
         return True
-    near = np.empty((1, 2))
-    is_finite = fill_model_errors(
-        position.reshape(1, 3), axis.reshape(1, 3), length, model.uncertain, model.spacing,
-        model.modes, model.sigma, memory.errors[s : s + 1], memory.whitening[s : s + 1], near,
-    )  # fmt: skip
-    for i in range(3):
-        at[i], at[3 + i] = position[i], axis[i]
-    memory.reach_m[s] = ERROR_REACH * near[0, 0] if is_finite else -1.0
-    memory.among[s] = near[0, 1]
-    return is_finite
+    coil, here, along = np.array([s]), position.reshape(1, 3), axis.reshape(1, 3)
+    return _take_errors_of(coil, here, along, length, memory, model)
 
 
 @kernel
@@ -215,6 +235,9 @@ def follow_coils(stamp_ns, values, sound, lengths, memory, model, rules, out):  
     ``lengths`` (S,), m; ``model`` is `SolveContext.arrays`, ``rules`` are `Rules`. ``out`` is
     `Followed`, with `UNKNOWN` on entry. Returns False where the model's covariance is not finite.
     """
+    # Where they are expected, and for which of them the model's error there is not known
+    is_warm = np.zeros(values.shape[0], np.bool_)
+    unknown, count = np.empty_like(memory.good_ns), 0
     for s in range(values.shape[0]):
         power, flux = 0.0, values[s]
         if not sound[s] or memory.good_ns[s] == 0:
@@ -225,10 +248,20 @@ def follow_coils(stamp_ns, values, sound, lengths, memory, model, rules, out):  
             power += (flux[k] / model.sigma[k]) ** 2
         if math.sqrt(power / flux.shape[0]) < rules.min_signal:
             continue
+        is_warm[s] = True
+        _expect(s, stamp_ns, memory, out.position[s], out.axis[s])
+        if not _knows_errors(s, out.position[s], out.axis[s], memory, model):
+            unknown[count] = s
+            count += 1
+    coils = unknown[:count]
+    if count > 0 and not _take_errors_of(
+        coils, out.position[coils], out.axis[coils], lengths[coils], memory, model
+    ):
+        return False
+    for s in range(values.shape[0]):
+        if not is_warm[s]:
+            continue
         position, axis, row = out.position[s], out.axis[s], slice(s, s + 1)
-        _expect(s, stamp_ns, memory, position, axis)
-        if not take_errors(s, position, axis, lengths[row], memory, model):
-            return False
         descend(
             out.position[row], out.axis[row], lengths[row], values[row], memory.whitening[row],
             model.columns, model.moments, model.low, model.high, rules.most_steps,

@@ -50,10 +50,11 @@ def fill_model_errors(  # type: ignore[no-untyped-def]
     """
     width, count = sigma.shape[0], errors.shape[1]
     factor, scaled = np.empty((width, width)), np.empty((width, count))
-    basis = np.empty((1, dipoles.shape[1]))
+    basis = np.empty((points.shape[0], dipoles.shape[1]))
+    fill_flux_basis(points, axes, lengths, dipoles, basis)
+    flux = np.dot(basis, modes)
     for s in range(points.shape[0]):
-        fill_flux_basis(points[s : s + 1], axes[s : s + 1], lengths[s : s + 1], dipoles, basis)
-        flux, out, square, among = np.dot(basis, modes), whitening[s], math.inf, 0.0
+        out, square, among = whitening[s], math.inf, 0.0
         for j in range(dipoles.shape[1]):
             away = 0.0
             for i in range(3):
@@ -62,7 +63,7 @@ def fill_model_errors(  # type: ignore[no-untyped-def]
         near[s, 0], near[s, 1] = math.sqrt(square), math.sqrt(among)
         for i in range(width):
             for r in range(count):
-                errors[s, r, i] = flux[0, r * width + i]
+                errors[s, r, i] = flux[s, r * width + i]
                 scaled[i, r] = errors[s, r, i] / sigma[i]
         gram = np.dot(scaled, scaled.T)
         for i in range(width):
