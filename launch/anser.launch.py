@@ -39,7 +39,7 @@ ARGUMENTS = {
     'board_seed': ('0', "the simulated unit's board: 0 as drawn, 1 that of demo_model.yaml"),
     'simulate': ('false', 'whether a simulated control unit replaces the real one'),
     'replay': ('', 'bag that is played in place of a control unit'),
-    'composed': ('false', 'whether acquisition, field model and tracker are one process, live'),
+    'composed': ('true', 'whether acquisition, field model and tracker are one process, live'),
     'optical': ('/optical', 'namespace of the optical poses'),
     'frame_prefix': ('', 'prefix of the frames of poses, clouds, metal and /tf'),
     'record': ('', 'whether a bag is recorded; by default true, but for a replay'),

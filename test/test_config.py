@@ -174,8 +174,8 @@ def test_a_bag_is_played_in_place_of_a_control_unit(launched, tmp_path):
     wanted = 'is_played', 'is_acquired', 'simulate', 'composed', 'record'
     assert [played[name] for name in wanted] == ['true', 'false', 'false', 'false', 'false']
     assert launched(replay='scan', record='true')['record'] == 'true'
-    assert [launched()[name] for name in wanted] == ['false', 'true', 'false', 'false', 'true']
-    assert launched(composed='true')['is_acquired'] == 'false'
+    assert [launched()[name] for name in wanted] == ['false', 'false', 'false', 'true', 'true']
+    assert launched(composed='false')['is_acquired'] == 'true'
     with pytest.raises(AnserError, match='nowhere: no such bag'):
         launched(replay='nowhere')
 
