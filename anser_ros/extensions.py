@@ -12,7 +12,6 @@ an object in it; it is loaded when the core uses it. Tables that are not stated 
 - ``ENGINES``: tuples of `sessions.calibration.Engine`, asked before the scan's own.
 - ``DIAGNOSES``: modules that diagnose sessions of their kind, see `sessions.diagnosis.other_way`.
 - ``OBSERVERS``: what else is tracked in a session, see `sessions.tracked_session.SessionObserver`.
-- ``EVALUATIONS``: modules that add options to `anser evaluate`, see `cli.evaluate`.
 - ``STREAMS``: what a watcher can watch besides fluxes, by the parameter that asks for it.
 - ``PASSIVE``: nodes for which no source waits.
 """

@@ -38,7 +38,6 @@ WRONG = {
     'handeye': [NOWHERE],
     'import': [NOWHERE, '--out', 'x.mcap'],
     'import_poses': [NOWHERE, '--out', 'x.mcap'],
-    'known_metal': f'{NOWHERE} --model x --baseline x --name a --out x/y.yaml'.split(),
     'loop': ['--duration', '-1'],
     'measured': ['gremlin'],
     'paper': ['--sessions', NOWHERE, '--out', 'x'],

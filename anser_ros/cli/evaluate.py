@@ -11,10 +11,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from anser_ros import extensions
 from anser_ros.cli import output, sessions
 from anser_ros.cli import page as html
-from anser_ros.cli.commands import SESSION_KINDS
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
@@ -214,10 +212,6 @@ def error_rows(document: Mapping[str, Any]) -> list[list[str]]:
     ]
 
 
-ALONE = ('refit', 'baseline', 'references', 'witnesses', 'in_phase', *SESSION_KINDS)
-"""Options that do not go together with another way to follow metal (`extensions`)."""
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         'example: anser evaluate bags/metal.mcap --model config/demo_model.yaml'
@@ -246,8 +240,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help='let the refit also use contradictions among the coils of rigid tools; for few '
         'references',
     )  # fmt: skip
-    for extension in extensions.loaded('EVALUATIONS'):
-        extension.add_options(parser)
     words = "use in-phase fluxes only, the article's way"
     parser.add_argument('--in-phase', action='store_true', help=words)
     parser.add_argument(
@@ -273,9 +265,6 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
 
 
 def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
-    given = [f'--{name.replace("_", "-")}' for name in ALONE if getattr(args, name)]
-    ways = [way.models(args, given) for way in extensions.loaded('EVALUATIONS')]
-    models = next((way for way in ways if way is not None), None)
     if kind := sessions.named_kind(args):
         done: output.Result = kind.evaluate(args, tell)
         return done
@@ -292,7 +281,7 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     output.make_folder(args.out)
     evaluation = track_session(
         session, model, TrackerSettings(gate=args.gate), baseline=baseline, refit=args.refit,
-        in_phase=args.in_phase, witnesses=args.witnesses, models=models,
+        in_phase=args.in_phase, witnesses=args.witnesses,
         progress=lambda share: tell('tracking', share),
     )  # fmt: skip
     document = {**to_document(evaluation), 'recording': recording_of(session)}
@@ -306,7 +295,7 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     )[-1:]  # fmt: skip
     shown: list[Any] = [output.terminal_table(ERRORS_HEAD, error_rows(document))]
     if 'refit' in document:
-        shown.append(_refit_line(document['refit'], models is None))
+        shown.append(_refit_line(document['refit']))
     notes = (
         *sessions.snapshot_notes(args.model, model),
         *output.loss_notes(session, baseline),
@@ -352,10 +341,8 @@ def why_withheld(model: FieldModel, evaluation: Evaluation) -> tuple[str, ...]:
     )
 
 
-def _refit_line(refit: dict[str, dict[str, int]], is_refit: bool) -> str:
-    """What the refit, or another way to follow metal, did, in a line."""
+def _refit_line(refit: dict[str, dict[str, int]]) -> str:
+    """What the refit did, in a line."""
     states = ', '.join(f'{name} in {count} frames' for name, count in refit['states'].items())
     out = ', '.join(f'{name} in {count}' for name, count in refit['left_out'].items())
-    if not is_refit:
-        return f'known metal: {states}'
     return f'refit: {states or "no frame"}; left out: {out or "no reference"}'

@@ -3,11 +3,9 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 
-from anser_ros.chain.chain import Refits
 from anser_ros.chain.model_half import ModelHalf
 from anser_ros.errors import BagError, FitError, ParameterError
 from anser_ros.frames.intake import Frame
@@ -65,12 +63,6 @@ class RefitSummary:
         """Count one frame's result."""
         self.states[result.state] += 1
         self.left_out.update(result.left_out)
-
-
-class FrameModels(Refits, Protocol):
-    """Gives each frame of a session the model that it is tracked with."""
-
-    summary: RefitSummary
 
 
 class ModelFollower(ModelHalf):

@@ -23,7 +23,7 @@ from anser_ros.fingerprint import fingerprint_of
 from anser_ros.physics.rotations import axis_angles, rotation_angles
 from anser_ros.pose_states import OK
 from anser_ros.sessions.baseline import check_place
-from anser_ros.sessions.follower import FrameModels, ModelFollower, RefitSummary
+from anser_ros.sessions.follower import ModelFollower, RefitSummary
 from anser_ros.sessions.prepared import PreparedSession, prepare, settings_for, with_truth
 from anser_ros.sessions.session import Session, frames_of
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
@@ -54,7 +54,7 @@ def in_phase_model(model: FieldModel) -> FieldModel:
 def track(
     prepared: PreparedSession,
     settings: TrackerSettings | None = None,
-    follower: FrameModels | None = None,
+    follower: ModelFollower | None = None,
     in_phase: bool = False,
     progress: Progress | None = None,
 ) -> 'Evaluation':
@@ -74,7 +74,7 @@ def track(
     settings = replace(settings, volume=settings.volume or prepared.volume)
     settings = settings_for(prepared.session.setup, settings, prepared.model)
     # A drift's recorded course is used if nothing follows it.
-    course = prepared.recorded_drift and not isinstance(follower, ModelFollower)
+    course = prepared.recorded_drift and follower is None
     settings = replace(settings, recorded_drift=course)
     tracker = Tracker(prepared.model, prepared.sensors, settings, observers)
     estimates: dict[str, list[PoseEstimate]] = {}
@@ -190,33 +190,24 @@ def track_session(
     in_phase: bool = False,
     progress: Progress | None = None,
     witnesses: bool = False,
-    models: Callable[[PreparedSession], FrameModels] | None = None,
 ) -> Evaluation:
     """Track every tool sensor and body of a session at every frame, and compare with the optics.
 
     A baseline is a distortion-free recording of the same board. With ``refit`` the model follows
-    the references as it does live, with witnesses also what the coils of rigid tools contradict;
-    ``models`` gives each frame's model in another way, instead of a refit. In phase, only these
-    fluxes and moments are used (the article's way). Progress gets the finished share, 0 to 1.
-    Raises `BagError` when the session has no tool fluxes, or a refit lacks references or a
-    baseline; `ParameterError` when such models are to be used beside a refit, or with one phase of
-    the fluxes, or a baseline without a refit; `ModelFileError` when the model's emitters are not
-    the session's, or its references locate the board elsewhere, which is not checked with the gate
-    switched off.
+    the references as it does live, with witnesses also what the coils of rigid tools contradict.
+    In phase, only these fluxes and moments are used (the article's way). Progress gets the
+    finished share, 0 to 1. Raises `BagError` when the session has no tool fluxes, or a refit lacks
+    references or a baseline; `ParameterError` for a baseline without a refit; `ModelFileError`
+    when the model's emitters are not the session's, or its references locate the board elsewhere,
+    which is not checked with the gate switched off.
     """
-    if models is not None and (refit or in_phase):
-        raise ParameterError(
-            "models of their own are used without a refit, with both of the fluxes' phases"
-        )
     if baseline is not None and not refit:
         raise ParameterError('a baseline is of a refit, and has no effect without one')
     if settings is None or settings.has_gate:
         check_place(model, session)
     used = in_phase_model(model) if in_phase else model
     prepared = prepare(session, used, baseline)
-    follower = None if models is None else models(prepared)
-    if refit:
-        follower = ModelFollower(prepared, witnesses)
+    follower = ModelFollower(prepared, witnesses) if refit else None
     return track(prepared, settings, follower, in_phase, progress)
 
 

@@ -3,7 +3,6 @@
 OFFLINE = {
     'batch': 'calibrate, evaluate or diagnose many sessions with Dask, with a summary',
     'compare': 'compare two evaluations of a session, paired, with bootstrap intervals',
-    'known_metal': 'learn a piece of metal from a session, for evaluate --known-metal',
     'loop': 'put an effect into simulated samples, find it blind, correct it, measure again',
     'measured': "other people's measurements: what they contain, and the error before and after",
     'paper': "redo the article's experiments: Tables II to V, Figs. 2 and 5 to 10",
@@ -11,4 +10,3 @@ OFFLINE = {
 ENGINES = ('calibration_engines:ENGINES',)
 DIAGNOSES = ('few_poses',)
 OBSERVERS = ('source_track:Sources',)
-EVALUATIONS = ('cli.known_metal',)

@@ -45,8 +45,7 @@ from anser_ros.sessions.tracked_session import error_statistics
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.wire.text_files import read_document
 
-UNUSED = ('refit', 'baseline', 'references', 'witnesses', 'in_phase', 'known_metal', 'resurveyed',
-          'stated')  # fmt: skip
+UNUSED = ('refit', 'baseline', 'references', 'witnesses', 'in_phase', 'resurveyed', 'stated')
 """Options of other sessions."""
 UNSHOWN = ('centre_m', 'size_m', 'lowest', 'is_equal', 'middle_s', 'degree', 'strain', 'times_s',
            'recordings')  # fmt: skip
