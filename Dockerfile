@@ -35,7 +35,7 @@ RUN apt-get update && apt-get install -y --no-install-recommends \
 
 # What has no package in Ubuntu; the lock keeps the rest of the system's Python as it is.
 RUN python3 -m pip install --no-cache-dir --break-system-packages --no-deps \
-    allantools mcap mcap-ros2-support zstandard lz4 distributed dask click cloudpickle fsspec jinja2 locket markupsafe msgpack partd psutil sortedcontainers tblib toolz tornado urllib3 zict aiofiles aiohappyeyeballs aiohttp aiosignal annotated-doc annotated-types anyio attrs bidict fastapi frozenlist h11 httpcore httptools httpx ifaddr itsdangerous markdown2 multidict nicegui opentelemetry-api orjson propcache pydantic pydantic-core python-dotenv python-engineio python-multipart python-socketio simple-websocket starlette tinycss2 typing-inspection uvicorn uvloop watchfiles webencodings websockets wsproto yarl certifi idna pygments docutils typing-extensions
+    allantools mcap mcap-ros2-support zstandard lz4 click jinja2 markupsafe aiofiles aiohappyeyeballs aiohttp aiosignal annotated-doc annotated-types anyio attrs bidict fastapi frozenlist h11 httpcore httptools httpx ifaddr itsdangerous markdown2 multidict nicegui opentelemetry-api orjson propcache pydantic pydantic-core python-dotenv python-engineio python-multipart python-socketio simple-websocket starlette tinycss2 typing-inspection uvicorn uvloop watchfiles webencodings websockets wsproto yarl certifi idna pygments docutils typing-extensions
 
 WORKDIR /workspace
 COPY . src/anser_ros

@@ -51,7 +51,6 @@ setup(
         'allantools>=2024.6',
     ],
     extras_require={
-        'batch': ['dask>=2024.8', 'distributed>=2024.8'],
         'dashboard': ['nicegui>=3.0', 'fastapi>=0.110', 'uvicorn>=0.30'],
         'docs': ['sphinx>=9', 'myst-parser>=5', 'furo>=2025.9'],
     },

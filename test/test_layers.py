@@ -59,8 +59,6 @@ ROOMS = {
     'pyigtl': (),
     'rich': (*NODES, *COMMANDS),
     'matplotlib': ('api/', 'apps/lab/experiments/', *COMMANDS),
-    'dask': ('apps/lab/cli/batch.py',),
-    'distributed': ('apps/lab/cli/batch.py',),
     'magpylib': (),
     'nicegui': ('apps/dashboard/',),
     'fastapi': ('apps/dashboard/',),

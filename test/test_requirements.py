@@ -67,7 +67,7 @@ def required():
 def optional():
     """Return the distributions that only some commands and nodes need."""
     extras = asked_for('extras_require')
-    return names_of(extras['batch'] + extras['dashboard'])
+    return names_of(extras['dashboard'])
 
 
 def package(tag):
@@ -155,7 +155,7 @@ def test_what_a_single_step_needs_is_not_needed_to_read_the_help():
     """A command is imported for its help; bags' own packages nearly every command needs."""
     bags = ('mcap', 'mcap_ros2', 'zstandard')
     few = [name for name in cli.PYPI if name not in bags]
-    assert {'allantools', 'dask', 'distributed'} <= set(few)
+    assert {'allantools', 'nicegui'} <= set(few)
     import_without(few, [module for module, _ in OFFLINE.values()])
 
 

@@ -39,12 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--out', required=True, type=Path, help=words)
     words = 'folder for calibration.json and choice.png, made if missing'
     parser.add_argument('--report', type=Path, help=words)
-    add_options(parser)
     output.add_json(parser, 'calibration.json on stdout')
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Declare the options that hold for every calibration."""
     words = "write the model even when its held-out error is worse than the nominal model's"
     parser.add_argument('--force', action='store_true', help=words)
     words = 'use a layer of N x N z-dipoles on the board; chosen by held-out error by default'

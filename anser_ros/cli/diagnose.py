@@ -14,11 +14,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from anser_ros.arrays import Array
-from anser_ros.cli import output
+from anser_ros.cli import output, sessions
 from anser_ros.cli import page as html
 from anser_ros.cli.calibrate import population_figure, population_table
 from anser_ros.cli.diagnosis_words import flux_unit, held_out_rows, short_ones, value_text, verdict
-from anser_ros.cli.sessions import add_session_kinds, named_kind, need_model, snapshot_notes
 from anser_ros.diagnosis.problem import Part, State, tool_parts
 from anser_ros.diagnosis.search import Candidate
 from anser_ros.field.model import EffectRecord
@@ -35,24 +34,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         'example: anser diagnose bags/moving.mcap --model config/demo_model.yaml --out result/'
     )
-    parser.add_argument('session', help='bag to diagnose (.mcap file or bag folder)')
-    output.add_out(parser, 'the results')
-    add_options(parser)
-    output.add_json(parser, 'diagnosis.json on stdout')
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Declare the options that hold for every session."""
+    words = 'bags to diagnose (.mcap files or bag folders)'
+    parser.add_argument('sessions', nargs='+', metavar='BAG', help=words)
+    output.add_out(parser, sessions.RESULTS)
+    output.add_json(parser, 'diagnosis.json, or the summary, on stdout')
     output.add_session_options(parser)
-    add_session_kinds(parser)
+    sessions.add_session_kinds(parser)
 
 
 def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
-    """Diagnose the session of the arguments into its folder, by the way that its kind needs."""
-    if kind := named_kind(args):
+    """Diagnose the session of the arguments into its folder; several one after the other."""
+    return sessions.on_each('diagnose', _one, args, tell)
+
+
+def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
+    """Diagnose one session, by the way that its kind needs."""
+    if kind := sessions.named_kind(args):
         done: output.Result = kind.diagnose(args, tell)
         return done
-    need_model(args)
+    sessions.need_model(args)
     idle = () if args.baseline else (n for n in VALUES if n not in USED_ALONE)
     stated = output.stated_values(args, idle, '--baseline')
     session = load_session(args.session).with_stated(stated)
@@ -74,7 +74,7 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     written = output.write_files(args.out, {'report.html': report, 'diagnosis.json': document})
     return output.Result(
         document,
-        (*snapshot_notes(args.model, model), *output.loss_notes(session, baseline)),
+        (*sessions.snapshot_notes(args.model, model), *output.loss_notes(session, baseline)),
         (
             output.terminal_table(['held out', 'before', 'after'], held_out_rows(document)),
             verdict(document),

@@ -219,17 +219,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     words = 'bags to track (.mcap files or bag folders)'
     parser.add_argument('sessions', nargs='+', metavar='BAG', help=words)
-    parser.add_argument(
-        '--out', required=True, type=Path,
-        help='folder for the results, made if missing; with several bags each has a folder in '
-        'it, and summary.csv and summary.html summarise them',
-    )  # fmt: skip
-    add_options(parser)
+    output.add_out(parser, sessions.RESULTS)
     output.add_json(parser, 'evaluation.json, or the summary, on stdout')
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Declare the options that hold for every session."""
     output.add_session_options(parser, idle='optical_rotation_rad')
     words = 'let the model follow the reference sensors'
     parser.add_argument('--refit', action='store_true', help=words)
@@ -252,16 +243,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     """Evaluate the session of the arguments into its folder; several one after the other."""
-    if len(args.sessions) == 1:
-        args.session = args.sessions[0]
-        return _one(args, tell)
-    runs = sessions.runs_of('evaluate', args)
-    output.make_folder(args.out)
-    outcomes = []
-    for count, one in enumerate(runs):
-        tell('evaluating', count / len(runs))
-        outcomes.append(sessions.perform(one))
-    return sessions.summed_up('evaluate', outcomes, args.out)
+    return sessions.on_each('evaluate', _one, args, tell)
 
 
 def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:

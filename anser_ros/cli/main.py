@@ -168,16 +168,14 @@ def _usage() -> str:
 
 PYPI = {
     'allantools': 'allantools',
-    'dask': 'dask',
-    'distributed': 'distributed',
     'mcap': 'mcap',
     'mcap_ros2': 'mcap-ros2-support',
     'zstandard': 'zstandard',
     'nicegui': 'nicegui',
 }
 """Modules without a key of rosdep, and what they are called on PyPI."""
-OPTIONAL = ('dask', 'distributed', 'nicegui')
-"""Of these, what only `anser batch` and the live view in a browser need."""
+OPTIONAL = ('nicegui',)
+"""Of these, what only the live view in a browser needs."""
 ROS = 'rclpy'
 """Module that every node needs, and that pip does not install with this package."""
 ROS_REMEDY = 'source /opt/ros/jazzy/setup.bash, or use the environment that `make` makes'

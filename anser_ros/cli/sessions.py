@@ -1,28 +1,23 @@
-"""Runs commands on sessions: which kind one is, many of them alone, and their summary."""
+"""Runs commands on sessions: which kind one is, several of them alone, and their summary."""
 
 import argparse
-import contextlib
 import csv
 import importlib
 import math
-import os
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
 from rich.table import Table
 
-from anser_ros.cli.commands import OFFLINE, SESSION_KINDS
+from anser_ros.cli.commands import SESSION_KINDS
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, EXIT_OK, attempt
-from anser_ros.cli.output import Result, make_folder, number
+from anser_ros.cli.output import Result, Tell, make_folder, number
 from anser_ros.cli.page import Html, escaped, page, paragraph, table, top
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
-from anser_ros.parallel import shared_among
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.starting_model import SNAPSHOT, is_snapshot
 
@@ -68,6 +63,9 @@ SCHEMA = 'anser_summary/1'
 WIDE = 'body { max-width: 90em } td, th { padding: .25em .5em }'
 """Style of a page whose table has many columns."""
 FILES = ('summary.csv', 'summary.html')
+RESULTS = (
+    f'the results; of several sessions each has a folder in it, with {" and ".join(FILES)} beside'
+)
 MM, DEG, PT, PERCENT = 1e3, DEGREES, 1e12, 1e2
 """Factors from SI to the units of the table: mm a metre, degrees a radian, pT a tesla, percent."""
 
@@ -119,15 +117,6 @@ DIAGNOSIS = (
     Column('orientation_rmse_after_rad', 'after', DEG),
     Column('unexplained_fraction', 'unexplained %', PERCENT),
 )
-CALIBRATION = (
-    Column('n_measurements', 'readings'),
-    Column('n_dipoles', 'dipoles', is_short=True),
-    Column('flux_rmse_t', 'flux pT', PT, is_short=True),
-    Column('heldout_flux_rmse_t', 'held out pT', PT, is_short=True),
-    Column('heldout_n_rmse_percent', 'held out, % of range', is_short=True),
-    Column('heldout_n_mae_percent', 'held out, % of range, MAE'),
-    Column('effects', 'effects', is_short=True),
-)
 
 
 def _evaluation(document: Mapping[str, Any]) -> Row:
@@ -150,16 +139,14 @@ def _evaluation(document: Mapping[str, Any]) -> Row:
     return row
 
 
-def _found(document: Mapping[str, Any]) -> Row:
+def _diagnosis(document: Mapping[str, Any]) -> Row:
     names = ' '.join(dict.fromkeys(one['name'] for one in document['effects']))
-    fraction = document.get('unexplained', {}).get('fraction')
-    found = {'effects': names, 'unexplained_fraction': fraction}
-    return {**document, **document.get('held_out', {}), **found}
+    fraction = document['unexplained']['fraction']
+    return {**document['held_out'], 'effects': names, 'unexplained_fraction': fraction}
 
 
 COMMANDS: dict[str, tuple[tuple[Column, ...], Callable[[Mapping[str, Any]], Row], str]] = {
-    'calibrate': (CALIBRATION, _found, 'calibration.json'),
-    'diagnose': (DIAGNOSIS, _found, 'report.html'),
+    'diagnose': (DIAGNOSIS, _diagnosis, 'report.html'),
     'evaluate': (EVALUATION, _evaluation, 'evaluation.html'),
 }
 """Of each command its columns, how its document becomes a row, and its file to look at."""
@@ -236,33 +223,6 @@ def _page(command: str, folder: Path, rows: Sequence[Row]) -> str:
     )
 
 
-ALONE = threading.Lock()
-"""One session at a time in a process: drawing, the working folder and the threads are shared."""
-
-
-@dataclass(frozen=True)
-class SessionRun:
-    """A command to run on one session, by the arguments that its ``work`` takes."""
-
-    command: str  # calibrate, diagnose or evaluate
-    name: str  # the session's in the summary, and of its folder
-    session: str  # the bag
-    args: argparse.Namespace
-    folder: str  # from which the paths in the arguments hold
-
-
-def runs_of(command: str, args: argparse.Namespace) -> list[SessionRun]:
-    """Return the runs of a command on all sessions of its arguments, each into its own folder."""
-    runs = []
-    for session, name in zip(args.sessions, names_of(args.sessions), strict=True):
-        own = argparse.Namespace(**{**vars(args), 'session': session, 'sessions': [session]})
-        own.out = args.out / name
-        if command == 'calibrate':
-            own.out, own.report = own.out / 'model.yaml', own.out
-        runs.append(SessionRun(command, name, session, own, os.getcwd()))
-    return runs
-
-
 def names_of(sessions: Sequence[str]) -> list[str]:
     """Return names for sessions by their paths: as many last parts as distinguish them.
 
@@ -285,29 +245,39 @@ def names_of(sessions: Sequence[str]) -> list[str]:
     ]
 
 
-def perform(run: SessionRun, threads: int | None = None) -> Outcome:
-    """Do a run in this process, whatever comes of it.
+Work = Callable[[argparse.Namespace, Tell], Result]
+"""The work of a command on the ``session`` of its arguments, into their folder ``out``."""
 
-    It may share its work among as many threads as are stated, by default as its caller.
+
+def on_each(command: str, work: Work, args: argparse.Namespace, tell: Tell) -> Result:
+    """Do a command's work on the only session of its arguments, or on one after the other.
+
+    Of several each has a folder of its own, whatever comes of the others, and a row in a summary.
     """
-    module = importlib.import_module(OFFLINE[run.command][0])
+    if len(args.sessions) == 1:
+        args.session = args.sessions[0]
+        return work(args, tell)
+    names = names_of(args.sessions)
+    make_folder(args.out)
+    outcomes = []
+    for count, (session, name) in enumerate(zip(args.sessions, names, strict=True)):
+        tell(command, count / len(names))
+        own = argparse.Namespace(**{**vars(args), 'session': session, 'out': args.out / name})
+        outcomes.append(_outcome(name, work, own))
+    return summed_up(command, outcomes, args.out)
 
-    def work() -> Result:
-        sharing = contextlib.nullcontext() if threads is None else shared_among(threads)
-        with contextlib.chdir(run.folder), sharing:
-            done: Result = module.work(run.args, lambda *_: None)
-            return done
 
-    with ALONE:
-        began_s = time.monotonic()
-        code, result, words = attempt(work)
-        seconds = time.monotonic() - began_s
+def _outcome(name: str, work: Work, args: argparse.Namespace) -> Outcome:
+    """What comes of one of several sessions."""
+    began_s = time.monotonic()
+    code, result, words = attempt(lambda: work(args, lambda *_: None))
+    seconds = time.monotonic() - began_s
     if result is not None:
         notes = '; '.join(result.notes)
-        return Outcome(run.name, run.session, code, result.document, notes, '', seconds)
+        return Outcome(name, args.session, code, result.document, notes, '', seconds)
     trace = words if code == EXIT_DEFECT else ''
     line = f'a defect of the program: {words.splitlines()[-1]}' if trace else words
-    return Outcome(run.name, run.session, code, {}, line, trace, seconds)
+    return Outcome(name, args.session, code, {}, line, trace, seconds)
 
 
 def summed_up(command: str, outcomes: Sequence[Outcome], folder: Path) -> Result:

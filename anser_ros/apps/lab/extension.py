@@ -1,7 +1,6 @@
 """States what this application adds to the core; `anser_ros.extensions` describes the tables."""
 
 OFFLINE = {
-    'batch': 'calibrate, evaluate or diagnose many sessions with Dask, with a summary',
     'compare': 'compare two evaluations of a session, paired, with bootstrap intervals',
     'loop': 'put an effect into simulated samples, find it blind, correct it, measure again',
     'measured': "other people's measurements: what they contain, and the error before and after",

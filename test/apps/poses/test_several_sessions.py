@@ -1,23 +1,17 @@
-"""Many sessions in one command: folders, the summary, failures as rows, and workers that die."""
+"""Several sessions in one command: folders, the summary, and failures as rows."""
 
 import argparse
 import contextlib
 import csv
-import importlib
 import io
 import math
-import os
-import signal
-import threading
 
 import pytest
-from conftest import wait
 from pose_world import World
 
-from anser_ros.apps.lab.cli import batch
 from anser_ros.apps.poses.importing import write_pose_session
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, EXIT_OK, main
-from anser_ros.cli.sessions import Outcome, names_of, perform, row_of, runs_of, write_summary
+from anser_ros.cli.sessions import Outcome, names_of, on_each, row_of, write_summary
 from anser_ros.errors import BagError, ParameterError
 
 pytestmark = pytest.mark.long
@@ -71,41 +65,6 @@ def test_several_sessions_of_evaluate_are_a_table_with_their_failures(sessions, 
     assert 'not an MCAP file' in page and page.count('<tr>') == 4
 
 
-@pytest.mark.processes
-def test_a_worker_that_dies_loses_nothing(sessions, alone, tmp_path, capfd):
-    """The only worker of a cluster is killed in the midst of its first session."""
-    from distributed import LocalCluster
-
-    done = []
-    with LocalCluster(
-        n_workers=1, threads_per_worker=1, dashboard_address='127.0.0.1:0'
-    ) as cluster:
-        arguments = ['batch', 'evaluate', *sessions, '--poses', '--out', str(tmp_path)]
-        arguments += ['--scheduler', cluster.scheduler_address]
-        batch = threading.Thread(target=lambda: done.append(main(arguments)))
-        batch.start()
-        first = cluster.workers[0].pid
-        workers = cluster.scheduler.workers
-        assert wait(lambda: any(one.processing for one in workers.values()))
-        os.kill(first, signal.SIGKILL)
-        batch.join()
-        assert cluster.workers[0].pid != first
-    assert done == [EXIT_BAD_INPUT]
-    rows = check(tmp_path, sessions)
-    for row, other in zip(rows, read(alone[0] / 'summary.csv'), strict=True):
-        assert {**row, 'seconds': 0} == {**other, 'seconds': 0}
-    capfd.readouterr()
-
-
-def test_a_scheduler_that_is_not_there_is_one_line(sessions, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(batch, 'CONNECT_S', 0.2)
-    arguments = ['--poses', '--out', str(tmp_path), '--scheduler', 'tcp://127.0.0.1:1']
-    assert main(['batch', 'evaluate', sessions[0], *arguments]) == EXIT_BAD_INPUT
-    said = capsys.readouterr().err
-    assert said.startswith('anser batch: no Dask scheduler at tcp://127.0.0.1:1')
-    assert said.count('\n') == 1
-
-
 def test_names_tell_sessions_apart(tmp_path):
     for day in ('mon', 'tue'):
         (tmp_path / day / 'scan').mkdir(parents=True)
@@ -117,23 +76,19 @@ def test_names_tell_sessions_apart(tmp_path):
         names_of([bags[0], bags[0]])
 
 
-class Module:
-    """A command that does as its session says."""
-
-    @staticmethod
+def test_a_defect_of_one_session_is_its_row_with_the_traceback(tmp_path):
     def work(args, tell):
         if args.session == 'bad':
             raise BagError('bad: no bag')
         raise ZeroDivisionError('of mine')
 
-
-def test_a_defect_of_one_session_is_its_row_with_the_traceback(monkeypatch, tmp_path):
-    monkeypatch.setattr(importlib, 'import_module', lambda name: Module)
     args = argparse.Namespace(sessions=['bad', 'worse'], out=tmp_path)
-    bad, worse = (perform(run) for run in runs_of('evaluate', args))
-    assert (bad.code, bad.words, bad.traceback) == (EXIT_BAD_INPUT, 'bad: no bag', '')
-    assert worse.code == EXIT_DEFECT and 'ZeroDivisionError: of mine' in worse.words
-    assert worse.traceback.startswith('Traceback') and worse.words.count('\n') == 0
+    result = on_each('evaluate', work, args, lambda *_: None)
+    bad, worse = result.document['sessions']
+    assert bad['message'] == 'bad: no bag' and result.code == EXIT_DEFECT
+    assert 'ZeroDivisionError: of mine' in worse['message'] and '\n' not in worse['message']
+    (trace,) = (note for note in result.notes if 'Traceback' in note)
+    assert trace.startswith('worse:\nTraceback')
 
 
 def test_a_row_is_the_pooled_error_of_all_coils(tmp_path):
