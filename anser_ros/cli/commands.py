@@ -41,8 +41,6 @@ _CORE = {
     'evaluate': 'track recorded sessions and compare their poses with the optical ones',
     'export': 'write poses and fluxes of a bag as CSV, TUM or MATLAB files',
     'import': "make a bag of tables (CSV, NumPy, MATLAB), or of another program's bag",
-    'place': 'propose places of reference coils, with the error that each number of them leaves',
-    'plan': 'which accuracy which effort of calibration buys, for a board and a tool',
     'setup': 'write a setup document by options and tables, check it, and draw it',
     'views': 'write the views of RViz and Foxglove for a setup document',
     'warm_up': 'compile all kernels once, before the first start of a node',

@@ -6,8 +6,8 @@ import numpy as np
 from conftest import REPO
 from test_drawn_calibration import NOISE_T, World, calibrated
 
+from anser_ros.apps.planning.cli.plan import pose_sigmas
 from anser_ros.cli.main import main
-from anser_ros.cli.plan import pose_sigmas
 from anser_ros.refit.clouds import region_of
 from anser_ros.sessions.session import load_session
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from refit_world import anser_world
 
+from anser_ros.apps.planning.design import choose, expected_errors, family, random_designs
 from anser_ros.cli.main import main
 from anser_ros.refit.clouds import Excitation, Region, region_of
-from anser_ros.refit.design import choose, expected_errors, family, random_designs
 from anser_ros.settings import RefitSettings
 
 UNCORRECTED_M = 5e-3
