@@ -7,8 +7,6 @@ an object in it; it is loaded when the core uses it. Tables that are not stated 
 - ``NODES``, ``OFFLINE``: commands with their line of help, in ``nodes`` and ``cli`` of the
   application; ``SESSION_KINDS``: kinds of sessions with their module and line; ``NEEDED``:
   packages that a node cannot do without. `cli.commands` and `cli.main` read these.
-- ``DEMO``: nodes that `anser demo` starts too, in its folder, where an option of their name asks
-  for it: the line of the option, and what the demo says then.
 - ``ENGINES``: tuples of `sessions.calibration.Engine`, asked before the scan's own.
 - ``DIAGNOSES``: modules that diagnose sessions of their kind, see `sessions.diagnosis.other_way`.
 - ``OBSERVERS``: what else is tracked in a session, see `sessions.tracked_session.SessionObserver`.

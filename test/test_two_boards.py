@@ -9,9 +9,9 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 from tracking_world import flux_points
 
+from anser_ros.apps.dashboard.nodes.monitor import Monitor
 from anser_ros.errors import LayoutError
 from anser_ros.nodes.field_model import FieldModelNode
-from anser_ros.nodes.monitor import Monitor
 from anser_ros.nodes.pose_output import PoseTopic
 from anser_ros.nodes.recorder import Recorder
 from anser_ros.nodes.replay import Replay

@@ -29,13 +29,11 @@ _NODES = {
     'grid': 'guides a coil through the places of a plate, and writes them as a session',
     'replay': 'publishes a bag again: replay BAG [--rate R] [--loop]',
     'cu_simulator': 'a control unit behind a pseudo-terminal',
-    'monitor': 'a live table of sensors, rates and latencies',
 }
 _COMPOSED = {'live': 'acquisition, field_model and tracker in one process, for the least latency'}
 _CORE = {
     'bags': 'record the small simulated sessions of the folder bags/',
     'calibrate': 'fit a field model to recorded sessions',
-    'demo': 'watch a simulated tool being tracked: a live table, a bag, a picture',
     'diagnose': 'find what a model leaves unexplained on a session, name the effect, correct it',
     'doctor': 'check the installation, ports, clock and graph, with a remedy for each problem',
     'evaluate': 'track recorded sessions and compare their poses with the optical ones',

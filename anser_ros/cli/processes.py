@@ -1,4 +1,4 @@
-"""Starts, watches and ends processes together, in a ROS domain of their own."""
+"""Starts, watches and ends nodes beside a simulated control unit, in a ROS domain of their own."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from anser_ros.cli.commands import COMPOSED, NODES
 from anser_ros.errors import ParameterError
 from anser_ros.parallel import hold
+from anser_ros.tracking.estimate import NO_GATE
 
 VARIABLE = 'ROS_DOMAIN_ID'
 LAST_DOMAIN = 101
@@ -139,3 +141,42 @@ def _prepare(parent: int) -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:  # it has ended before that
             os._exit(1)
+
+
+PATIENCE_S = 180.0
+"""Longest wait for all nodes and the first pose, s; kernels may have to be compiled meanwhile."""
+# The board of the bags in bags/, from which config/demo_model.yaml is calibrated:
+# anser calibrate bags/scan.mcap --out config/demo_model.yaml
+BOARD_SEED = 1
+# Half the usual rate, so that all processes together fit on two cores.
+SAMPLE_RATE_HZ = 20e3
+# The frozen chain shows the poses of a tracker without residual gate. With one it would withhold
+# them near metal, and nobody would see the error that the refit avoids.
+FROZEN_TRACKER = {'gate': NO_GATE, 'adaptive': False}
+SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
+
+
+def node_command(name: str, /, *words: str, **parameters: object) -> list[str]:
+    """Return the command line of a node, with further ROS arguments and its parameters.
+
+    ``NODE__NAME`` is a parameter of one of several nodes in one process.
+    """
+    module, _ = {**NODES, **COMPOSED}[name]
+    command = [sys.executable, '-P', '-m', module, '--ros-args', *words]
+    for key, value in parameters.items():
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        command += ['-p', f'{key.replace("__", ":")}:={text}']
+    return command
+
+
+def in_namespace(namespace: str) -> list[str]:
+    """Return the ROS arguments of a node beside the others, which takes their setup and fluxes."""
+    remaps = [f'{topic}:=/anser/{topic}' for topic in SHARED_TOPICS]
+    return [word for remap in (f'__ns:={namespace}', *remaps) for word in ('-r', remap)]
+
+
+def simulated_unit(port: Path, **parameters: object) -> list[str]:
+    return node_command(
+        'cu_simulator', link=port, board_seed=BOARD_SEED, sample_rate_hz=SAMPLE_RATE_HZ,
+        **parameters,
+    )  # fmt: skip

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 import harness
 import numpy as np
 
-from anser_ros.cli.demo import FROZEN
+from anser_ros.apps.dashboard.cli.demo import FROZEN
 from anser_ros.stamps import NANO, SECOND_NS, stamp_of
 from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages
 

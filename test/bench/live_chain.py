@@ -18,8 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from anser_ros.cli.demo import BOARD_SEED, node_command
-from anser_ros.cli.processes import Child, Supervisor
+from anser_ros.cli.processes import BOARD_SEED, Child, Supervisor, node_command
 from anser_ros.simulation.control_unit import ControlUnit, Piece
 from anser_ros.simulation.line import PseudoPort
 from anser_ros.simulation.world import Approach, World, board_source, manufactured, steel_disc

@@ -23,8 +23,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from chromium import BROWSER_OPTIONS, browser_of
 
-from anser_ros.cli.demo import BOARD_SEED, SAMPLE_RATE_HZ, node_command
-from anser_ros.cli.processes import Child, Supervisor, tail
+from anser_ros.cli.processes import (
+    BOARD_SEED,
+    SAMPLE_RATE_HZ,
+    Child,
+    Supervisor,
+    node_command,
+    tail,
+)
 from anser_ros.settings import Accuracy
 from anser_ros.simulation.effects import CATALOGUE
 from anser_ros.wire.text_files import config_path

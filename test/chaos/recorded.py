@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from table import Row
 
+from anser_ros.apps.dashboard.cli.demo import METAL_RADIUS_M
 from anser_ros.chain.chain import Chain
 from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.chain.model_half import ModelHalf
 from anser_ros.chain.tracking_half import TrackingHalf
-from anser_ros.cli.demo import BOARD_SEED, METAL_RADIUS_M
+from anser_ros.cli.processes import BOARD_SEED
 from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.rotations import rotation_of_vector

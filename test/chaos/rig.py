@@ -15,8 +15,15 @@ from typing import Any
 from line import Line
 from witness import WINDOW_S, Witness
 
-from anser_ros.cli.demo import BOARD_SEED, METAL_RADIUS_M, SAMPLE_RATE_HZ, node_command
-from anser_ros.cli.processes import Child, Supervisor, tail
+from anser_ros.apps.dashboard.cli.demo import METAL_RADIUS_M
+from anser_ros.cli.processes import (
+    BOARD_SEED,
+    SAMPLE_RATE_HZ,
+    Child,
+    Supervisor,
+    node_command,
+    tail,
+)
 from anser_ros.parallel import ONE_THREAD
 from anser_ros.wire.setup import parse_setup
 from anser_ros.wire.text_files import config_path, read_config

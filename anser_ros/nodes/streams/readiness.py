@@ -26,7 +26,7 @@ from anser_ros.wire.setup_values import tip_name
 
 TRACKER, FIELD_MODEL = 'tracker', 'field_model'
 # They take what there is, and nobody waits for them alone.
-PASSIVE = ('recorder', 'monitor', *chain(*extensions.tables('PASSIVE')))
+PASSIVE = ('recorder', *chain(*extensions.tables('PASSIVE')))
 LOOK_S = 3.3
 """Least time to look for others, s: nodes that are not ours announce themselves every three."""
 SETTLE_S = 1.0

@@ -21,6 +21,7 @@ from rclpy.serialization import serialize_message
 from tracking_world import certain_model
 
 from anser_ros.apps.dashboard import loop as loop_module
+from anser_ros.apps.dashboard.cli import demo
 from anser_ros.apps.dashboard.loop import RESULTS, CorrectionLoop, Found, Job, RecordingFolder
 from anser_ros.apps.dashboard.nodes import live_view
 from anser_ros.apps.dashboard.nodes.dashboard import (
@@ -30,6 +31,7 @@ from anser_ros.apps.dashboard.nodes.dashboard import (
     DashboardParameters,
 )
 from anser_ros.apps.dashboard.nodes.live_view import LiveView, read_pose
+from anser_ros.apps.dashboard.nodes.traces import latency_of
 from anser_ros.apps.dashboard.nodes.view_source import ViewSource, polling_node
 from anser_ros.apps.dashboard.server import (
     COOKIE,
@@ -39,14 +41,12 @@ from anser_ros.apps.dashboard.server import (
     PageServer,
     token_for,
 )
-from anser_ros.cli import demo
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.nodes.field_model import FieldModelNode
 from anser_ros.nodes.operator_words import LastStatus
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Level, Status, diagnostic_array
-from anser_ros.nodes.traces import latency_of
 from anser_ros.sessions.nominal_board import tracked_volume
 from anser_ros.sessions.starting_model import save_model
 from anser_ros.wire.setup import dump_setup, parse_setup
@@ -165,7 +165,7 @@ def test_the_demo_serves_it_if_asked_to(tmp_path):
         assert ('dashboard' in commands) == served
     assert Dashboard.__module__ in commands['dashboard']
     assert f'directory:={tmp_path}' in commands['dashboard']
-    assert f':{DashboardParameters.port}/' in demo._asked(args)['dashboard']
+    assert DashboardParameters.port == demo.LIVE_VIEW
 
 
 def bag(path):

@@ -21,8 +21,8 @@ from anser_ros.apps.lab.cli.loop import (
     verdict,
 )
 from anser_ros.apps.lab.recorded_health import ok_share
-from anser_ros.cli.demo import SAMPLE_RATE_HZ
 from anser_ros.cli.main import main
+from anser_ros.cli.processes import SAMPLE_RATE_HZ
 from anser_ros.effects.channels import FLUX, VOLTAGE
 from anser_ros.effects.effect import all_effects, effect_named
 from anser_ros.field.model import EffectRecord

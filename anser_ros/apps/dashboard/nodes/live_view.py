@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from anser_ros.apps.dashboard.nodes import traces
 from anser_ros.arrays import Array
-from anser_ros.nodes import traces
 from anser_ros.nodes.operator_words import causes
 from anser_ros.nodes.runtime.diagnostics import LastStatus
 from anser_ros.wire.setup import Setup

@@ -21,11 +21,19 @@ from rich.console import Console
 from rich.table import Table
 
 from anser_ros.apps.lab.recorded_health import kept_share, last_words, live_errors, ok_share
-from anser_ros.cli.demo import FROZEN_TRACKER, PATIENCE_S, in_namespace, simulated_unit
-from anser_ros.cli.demo import node_command as node
 from anser_ros.cli.main import check_packages
 from anser_ros.cli.output import add_json, add_out, make_new_folder, say_written, write_files
-from anser_ros.cli.processes import LAST_DOMAIN, Supervisor, own_domain, tail
+from anser_ros.cli.processes import (
+    FROZEN_TRACKER,
+    LAST_DOMAIN,
+    PATIENCE_S,
+    Supervisor,
+    in_namespace,
+    own_domain,
+    simulated_unit,
+    tail,
+)
+from anser_ros.cli.processes import node_command as node
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import AnserError, DiagnosisError, ParameterError, SetupError
 from anser_ros.field.model import FieldModel

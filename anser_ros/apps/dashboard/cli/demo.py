@@ -17,15 +17,24 @@ from typing import Any
 
 import numpy as np
 
-from anser_ros import extensions
+from anser_ros.apps.dashboard.extension import LIVE_VIEW
 from anser_ros.arrays import Array
-from anser_ros.cli.commands import COMPOSED, NODES
 from anser_ros.cli.main import check_packages
 from anser_ros.cli.output import add_json, add_out, make_new_folder
-from anser_ros.cli.processes import LAST_DOMAIN, VARIABLE, Supervisor, own_domain, tail
+from anser_ros.cli.processes import (
+    FROZEN_TRACKER,
+    LAST_DOMAIN,
+    PATIENCE_S,
+    VARIABLE,
+    Supervisor,
+    in_namespace,
+    node_command,
+    own_domain,
+    simulated_unit,
+    tail,
+)
 from anser_ros.errors import ParameterError
 from anser_ros.kernel_cache import compile_kernels
-from anser_ros.tracking.estimate import NO_GATE
 from anser_ros.wire.bag_writer import bag_summary
 from anser_ros.wire.text_files import config_path
 
@@ -163,23 +172,12 @@ def _joined(results: Results, kind: str, rank: int) -> Array:
 
 
 SCHEMA = 'anser_demo/1'
-PATIENCE_S = 180.0
-"""Longest wait for all nodes and the first pose, s; kernels may have to be compiled meanwhile."""
-# The board of the bags in bags/, from which config/demo_model.yaml is calibrated:
-# anser calibrate bags/scan.mcap --out config/demo_model.yaml
-BOARD_SEED = 1
-# Half the usual rate, so that all processes together fit on two cores.
-SAMPLE_RATE_HZ = 20e3
 METAL_RADIUS_M = 0.1
 """Radius of the steel disc, m: as large as the foot of a stand or the head of a C-arm."""
-# The frozen chain shows the poses of a tracker without residual gate. With one it would withhold
-# them near metal, and nobody would see the error that the refit avoids.
-FROZEN_TRACKER = {'gate': NO_GATE, 'adaptive': False}
 POLL_S = 0.05
 """Time from one look at the processes to the next, s: an ended node is noticed in it."""
 # The file that the monitor writes.
 DATA = 'demo.npz'
-SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -191,18 +189,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=Path('recordings'), metavar='DIR',
     )  # fmt: skip
     parser.add_argument('--rate', type=float, default=50.0, metavar='HZ', help='poses a second')
-    for name, (words, _) in _beside().items():
-        parser.add_argument(f'--{name}', action='store_true', help=words)
+    words = 'serve the live view to a browser, too'
+    parser.add_argument('--dashboard', action='store_true', help=words)
     add_json(parser, 'only the summary, as JSON')
-
-
-def _beside() -> dict[str, tuple[str, str]]:
-    """Nodes of applications that may run beside it: the line of the option, and what is said."""
-    return {name: lines for table in extensions.tables('DEMO') for name, lines in table.items()}
-
-
-def _asked(args: argparse.Namespace) -> dict[str, str]:
-    return {name: said for name, (_, said) in _beside().items() if getattr(args, name)}
 
 
 def run(args: argparse.Namespace) -> int:
@@ -211,7 +200,7 @@ def run(args: argparse.Namespace) -> int:
         raise ParameterError(f'--duration must be 1 to 3600 s, got {args.duration:g}')
     if not 1.0 <= args.rate <= 200.0:
         raise ParameterError(f'--rate must be 1 to 200 Hz, got {args.rate:g}')
-    for node in ('recorder', *_asked(args)):
+    for node in ('recorder', 'dashboard') if args.dashboard else ('recorder',):
         check_packages(node)
     stopped: list[int] = []
     before = {
@@ -241,8 +230,8 @@ def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
                 return _report(folder, args, interrupted=True)
             for name, command in _commands(folder, ports / 'cu', args).items():
                 supervisor.start(name, command)
-            for said in _asked(args).values():
-                _say(said, args)
+            if args.dashboard:
+                _say(f'live view: http://127.0.0.1:{LIVE_VIEW}/', args)
             # Quoted, as a colon has a meaning to ROS.
             command = node_command(
                 'monitor', duration_s=float(args.duration), patience_s=PATIENCE_S, compare=FROZEN,
@@ -329,35 +318,10 @@ def _print(summary: dict[str, object]) -> None:
             print(f'{key:>8}: {summary[key]}')
 
 
-def node_command(name: str, /, *words: str, **parameters: object) -> list[str]:
-    """Return the command line of a node, with further ROS arguments and its parameters.
-
-    ``NODE__NAME`` is a parameter of one of several nodes in one process.
-    """
-    module, _ = {**NODES, **COMPOSED}[name]
-    command = [sys.executable, '-P', '-m', module, '--ros-args', *words]
-    for key, value in parameters.items():
-        text = str(value).lower() if isinstance(value, bool) else str(value)
-        command += ['-p', f'{key.replace("__", ":")}:={text}']
-    return command
-
-
-def in_namespace(namespace: str) -> list[str]:
-    """Return the ROS arguments of a node beside the others, which takes their setup and fluxes."""
-    remaps = [f'{topic}:=/anser/{topic}' for topic in SHARED_TOPICS]
-    return [word for remap in (f'__ns:={namespace}', *remaps) for word in ('-r', remap)]
-
-
-def simulated_unit(port: Path, **parameters: object) -> list[str]:
-    return node_command(
-        'cu_simulator', link=port, board_seed=BOARD_SEED, sample_rate_hz=SAMPLE_RATE_HZ,
-        **parameters,
-    )  # fmt: skip
-
-
 def _commands(folder: Path, port: Path, args: argparse.Namespace) -> dict[str, list[str]]:
     model = config_path('demo_model.yaml')
     apart = in_namespace(f'/anser/{FROZEN}')
+    page = {'dashboard': node_command('dashboard', directory=folder)} if args.dashboard else {}
     return {
         'cu_simulator': simulated_unit(port, metal_radius_m=METAL_RADIUS_M),
         'live': node_command(
@@ -367,5 +331,5 @@ def _commands(folder: Path, port: Path, args: argparse.Namespace) -> dict[str, l
         'field_model_frozen': node_command('field_model', *apart, model_file=model),
         'tracker_frozen': node_command('tracker', *apart, **FROZEN_TRACKER),
         'recorder': node_command('recorder', directory=folder, name='bag'),
-        **{name: node_command(name, directory=folder) for name in _asked(args)},
+        **page,
     }  # fmt: skip

@@ -15,12 +15,12 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from std_msgs.msg import String
 
-from anser_ros.cli.demo import load, summarise
+from anser_ros.apps.dashboard.cli.demo import load, summarise
+from anser_ros.apps.dashboard.nodes.traces import OVERLAP, OpticalTrace, PoseTrace, targets_of
 from anser_ros.cli.output import make_new_folder, remove_empty_folders
 from anser_ros.cli.processes import Supervisor, own_domain, tail
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.traces import OVERLAP, OpticalTrace, PoseTrace, targets_of
 from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.setup import parse_setup, topic_of
 from anser_ros.wire.text_files import read_config

@@ -17,6 +17,14 @@ from rich.markup import escape
 from rich.table import Table
 from std_msgs.msg import String
 
+from anser_ros.apps.dashboard.nodes.traces import (
+    OpticalTrace,
+    PoseTrace,
+    Row,
+    latency_of,
+    middle,
+    targets_of,
+)
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.operator_words import causes
 from anser_ros.nodes.runtime import qos
@@ -24,7 +32,6 @@ from anser_ros.nodes.runtime.diagnostics import LastStatus, statuses_in
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
-from anser_ros.nodes.traces import OpticalTrace, PoseTrace, Row, latency_of, middle, targets_of
 from anser_ros.stamps import NANO, stamp_of
 from anser_ros.wire.recorded import optical_topic, pose_numbers
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
