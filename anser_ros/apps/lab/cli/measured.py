@@ -14,14 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from anser_ros.apps.lab.measured import (
-    anser_board,
-    hpi_coils,
-    ilemt,
-    magnet_patch,
-    navion,
-    transformer,
-)
+from anser_ros.apps.lab.measured import anser_board, hpi_coils, ilemt, magnet_patch, navion
 from anser_ros.apps.lab.measured.recipe import SHARED, Recipe, ReportRow, shared_folder
 from anser_ros.cli import main
 from anser_ros.cli.output import Result, add_json, add_out, make_folder, say, write_files
@@ -31,7 +24,7 @@ RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
     for recipe in (
         navion.RECIPE, magnet_patch.RECIPE, magnet_patch.STEP_RECIPE, hpi_coils.RECIPE,
-        anser_board.RECIPE, transformer.RECIPE, ilemt.RECIPE,
+        anser_board.RECIPE, ilemt.RECIPE,
     )
 }  # fmt: skip
 """Data sets that the shipped commands are run on."""
