@@ -17,7 +17,7 @@ ARGS ?=
 PACKAGING = setup.py package.xml anser_ros/cli/commands.py
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-core test-quick test-oldest lint format types parameters bench browser chaos soak paper loop measured docs clean
+.PHONY: help demo test test-core test-quick test-oldest lint format types parameters bags bench browser chaos soak paper loop measured docs clean
 
 help:
 	@echo 'make demo [DURATION=30]  watch a simulated tool being tracked'
@@ -62,6 +62,9 @@ types: $(READY)
 	@if [ -e $(VENV)/requirements-beside-ros.txt ]; then \
 		echo 'types: not checked beside a sourced ROS, whose numpy is older'; \
 	else $(VENV)/bin/mypy; fi
+
+bags: $(READY)
+	@$(VENV)/bin/python .ci/write_bags.py
 
 parameters: $(READY)
 	@$(VENV)/bin/python .ci/write_parameters.py

@@ -1,5 +1,6 @@
 """Bags read without ROS: whole, cut, damaged, and with content that is refused by name."""
 
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,6 @@ import pytest
 from conftest import REPO
 from tracking_world import flux_points
 
-from anser_ros.cli.main import main
 from anser_ros.errors import BagError
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.bag import Salvage, iter_messages, read_bag
@@ -207,8 +207,8 @@ NAMES = ('factory', 'moving', 'metal', 'scan')
 @pytest.fixture(scope='module')
 def remade(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp('bags')
-    setup = REPO / 'config' / 'demo_setup.yaml'
-    assert main(['bags', '--setup', str(setup), '--out', str(folder)]) == 0
+    writer = runpy.run_path(str(REPO / '.ci' / 'write_bags.py'))
+    writer['main'](['--out', str(folder)])
     return folder
 
 

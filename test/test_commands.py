@@ -25,7 +25,6 @@ DOCS = REPO / 'docs'
 NOWHERE = '/nowhere/x'
 WRONG = {
     'accuracy': ['rest', NOWHERE],
-    'bags': ['--setup', NOWHERE],
     'calibrate': [NOWHERE, '--out', 'x.yaml'],
     'compare': [NOWHERE, NOWHERE],
     'demo': ['--duration', '-1'],
@@ -59,7 +58,6 @@ the documents."""
 NOT_TEXT = [
     ['accuracy', 'single-point', 'poses.tum', '--tip', 'noise.yaml'],
     ['accuracy', 'point-to-point', 'poses.tum', '--truth', 'noise.yaml'],
-    ['bags', '--setup', 'noise.yaml'],
     ['error_map', 'noise.yaml'],
     ['import', 'noise.yaml'],
     ['import', 'BAGS/moving.mcap', '--setup', 'noise.yaml'],

@@ -32,7 +32,6 @@ _NODES = {
 }
 _COMPOSED = {'live': 'acquisition, field_model and tracker in one process, for the least latency'}
 _CORE = {
-    'bags': 'record the small simulated sessions of the folder bags/',
     'calibrate': 'fit a field model to recorded sessions',
     'diagnose': 'find what a model leaves unexplained on a session, name the effect, correct it',
     'doctor': 'check the installation, ports, clock and graph, with a remedy for each problem',

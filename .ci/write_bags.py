@@ -1,11 +1,10 @@
-"""Records the small simulated sessions of the folder bags/."""
+"""Record the small simulated sessions of the folder bags/ again."""
 
 import argparse
 from pathlib import Path
 
 import numpy as np
 
-from anser_ros.cli.output import Result, Tell, add_json, make_folder
 from anser_ros.settings import Accuracy
 from anser_ros.simulation.recording import STATIC_NOISE_T, GridScan, record
 from anser_ros.simulation.world import (
@@ -19,7 +18,8 @@ from anser_ros.simulation.world import (
 from anser_ros.wire.setup import parse_setup
 from anser_ros.wire.text_files import read_config
 
-SCHEMA = 'anser_bags/1'
+SEED = 1
+"""Of board and noise: the same one gives the same fluxes."""
 RATE_HZ = 25.0
 """Rate of the fluxes of moving tools, Hz: half of the demo's, which keeps the bags small."""
 OPTICAL_RATE_HZ = 60.0
@@ -35,22 +35,16 @@ SCAN_ERRORS = Accuracy(STATIC_NOISE_T, 0.01e-3, 0.05e-3)
 and 0.4 mrad each."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = 'example: anser bags --out bags/'
-    words = 'setup document: a path, or a file of config/ (%(default)s)'
-    parser.add_argument('--setup', default='demo_setup.yaml', help=words)
+def main(argv=None):
+    """Write factory, moving, metal and scan.mcap; bags of those names are replaced."""
+    parser = argparse.ArgumentParser(description=__doc__)
     words = 'folder for the bags, made if missing (%(default)s)'
     parser.add_argument('--out', type=Path, default=Path('bags'), metavar='DIR', help=words)
-    parser.add_argument('--seed', type=int, default=1, help='of board and noise (%(default)s)')
-    add_json(parser, 'what was written as JSON')
-
-
-def work(args: argparse.Namespace, tell: Tell) -> Result:
-    """Write factory, moving, metal and scan.mcap; bags of those names are replaced."""
-    setup = parse_setup(read_config(args.setup))
-    rng = np.random.default_rng(args.seed)
+    args = parser.parse_args(argv)
+    setup = parse_setup(read_config('demo_setup.yaml'))
+    rng = np.random.default_rng(SEED)
     source = board_source(manufactured(setup, rng))
-    make_folder(args.out)
+    args.out.mkdir(parents=True, exist_ok=True)
     scan, tall = GridScan(), GridScan(heights_m=SCAN_HEIGHTS_M)
     frames = int(SECONDS * RATE_HZ)
     # The path stays within the heights that the scan covers, outside which a model is worse.
@@ -67,18 +61,15 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         ('metal', metal, frames, RATE_HZ, OPTICAL_RATE_HZ, live),
         ('scan', scanned_tall, tall.frames, 1.0, None, SCAN_ERRORS),
     )
-    written = []
-    for rank, (name, world, count, rate, optical_rate, errors) in enumerate(sessions):
-        tell('recording', rank / len(sessions))
+    for name, world, count, rate, optical_rate, errors in sessions:
         file = args.out / f'{name}.mcap'
         file.unlink(missing_ok=True)
         record(
             str(file), world, frames=count, rate_hz=rate, optical_rate_hz=optical_rate,
             errors=errors, rng=rng,
         )  # fmt: skip
-        written.append({'file': str(file), 'frames': count, 'bytes': file.stat().st_size})
-    shown = tuple(
-        f'{one["file"]}: {one["frames"]} frames, {one["bytes"] / 1e6:.2f} MB, simulated'
-        for one in written
-    )
-    return Result({'schema': SCHEMA, 'bags': written}, (), shown)
+        print(f'{file}: {count} frames, {file.stat().st_size / 1e6:.2f} MB, simulated')
+
+
+if __name__ == '__main__':
+    main()
