@@ -16,11 +16,11 @@ from anser_ros.apps.lab.cli.loop import (
     TONES_HZ,
     UNEXPLAINED,
     WRONG,
+    ok_share,
     parameter_errors,
     table,
     verdict,
 )
-from anser_ros.apps.lab.recorded_health import ok_share
 from anser_ros.cli.main import main
 from anser_ros.cli.processes import SAMPLE_RATE_HZ
 from anser_ros.effects.channels import FLUX, VOLTAGE
