@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from anser_ros.apps.lab.comparison import FEWEST_BLOCKS, compare, read_errors
+from anser_ros.apps.lab.cli.compare import FEWEST_BLOCKS, compare, read_errors
 from anser_ros.cli.main import main
 from anser_ros.errors import ParameterError
 from anser_ros.pose_states import OK
