@@ -12,7 +12,6 @@ from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node, PushRosNamespace
-from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'anser_ros'
@@ -66,11 +65,7 @@ def generate_launch_description():
         'monitor',
         output='screen',
         duration_s=value('duration'),
-        compare='frozen',
-        # As a text, since the colon would make a mapping of it.
-        compare_note=ParameterValue(
-            'gate off: what a tracker without a residual gate would publish', value_type=str
-        ),
+        compare='frozen',  # its gate is off, as a tracker's without a residual gate
     )
     shared = [(topic, f'/anser/{topic}') for topic in SHARED_TOPICS]
     return LaunchDescription(

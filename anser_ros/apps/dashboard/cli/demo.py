@@ -176,8 +176,7 @@ METAL_RADIUS_M = 0.1
 """Radius of the steel disc, m: as large as the foot of a stand or the head of a C-arm."""
 POLL_S = 0.05
 """Time from one look at the processes to the next, s: an ended node is noticed in it."""
-# The file that the monitor writes.
-DATA = 'demo.npz'
+DATA = 'demo.npz'  # the file that the monitor writes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -188,7 +187,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser, 'a new folder with bag, picture and logs (%(default)s)', required=False,
         default=Path('recordings'), metavar='DIR',
     )  # fmt: skip
-    parser.add_argument('--rate', type=float, default=50.0, metavar='HZ', help='poses a second')
     words = 'serve the live view to a browser, too'
     parser.add_argument('--dashboard', action='store_true', help=words)
     add_json(parser, 'only the summary, as JSON')
@@ -198,8 +196,6 @@ def run(args: argparse.Namespace) -> int:
     """Run the demo and return the exit code; raises `ParameterError` on what cannot be run."""
     if not 1.0 <= args.duration <= 3600.0:
         raise ParameterError(f'--duration must be 1 to 3600 s, got {args.duration:g}')
-    if not 1.0 <= args.rate <= 200.0:
-        raise ParameterError(f'--rate must be 1 to 200 Hz, got {args.rate:g}')
     for node in ('recorder', 'dashboard') if args.dashboard else ('recorder',):
         check_packages(node)
     stopped: list[int] = []
@@ -232,10 +228,10 @@ def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
                 supervisor.start(name, command)
             if args.dashboard:
                 _say(f'live view: http://127.0.0.1:{LIVE_VIEW}/', args)
-            # Quoted, as a colon has a meaning to ROS.
+            _say(f'{FROZEN}: {MEANINGS[FROZEN]}', args)
             command = node_command(
                 'monitor', duration_s=float(args.duration), patience_s=PATIENCE_S, compare=FROZEN,
-                compare_note=f'"{MEANINGS[FROZEN]}"', output=folder / DATA,
+                output=folder / DATA,
             )  # fmt: skip
             monitor = supervisor.start('monitor', command, on_terminal=not args.json)
             while not stopped:
@@ -325,8 +321,8 @@ def _commands(folder: Path, port: Path, args: argparse.Namespace) -> dict[str, l
     return {
         'cu_simulator': simulated_unit(port, metal_radius_m=METAL_RADIUS_M),
         'live': node_command(
-            'live', acquisition__device=port, acquisition__rate_hz=float(args.rate),
-            field_model__model_file=model, field_model__baseline_at_start=True,
+            'live', acquisition__device=port, field_model__model_file=model,
+            field_model__baseline_at_start=True,
         ),
         'field_model_frozen': node_command('field_model', *apart, model_file=model),
         'tracker_frozen': node_command('tracker', *apart, **FROZEN_TRACKER),

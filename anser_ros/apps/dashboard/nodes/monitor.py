@@ -36,8 +36,8 @@ from anser_ros.stamps import NANO, stamp_of
 from anser_ros.wire.recorded import optical_topic, pose_numbers
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
-LINE_PERIOD_S = 1.0
-"""Time between two lines where the output is no terminal, s."""
+PERIOD_S, LINE_PERIOD_S = 0.25, 1.0
+"""Time between two tables, and between two lines where the output is no terminal, s."""
 NEWEST = 200
 """Optical poses with which the newest poses are compared."""
 WIDE = 100
@@ -59,12 +59,8 @@ class MonitorParameters:
         0.0, 'time without a pose after which it gives up; 0 for never, s', within=(0.0, math.inf)
     )
     compare: str = parameter('', 'namespace of a second tracker to show as well; empty for none')
-    compare_note: str = parameter('', 'what is special about the second tracker, in words')
     optical: str = optical_parameter()
     output: str = parameter('', 'file (.npz) to write all poses and errors to at the end')
-    period_s: float = parameter(
-        0.25, 'interval of the table; without a terminal one line a second, s', within=(0.05, 10.0)
-    )
 
 
 class Monitor(AnserNode):
@@ -76,9 +72,8 @@ class Monitor(AnserNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        table = self.parameters
-        if table.output:
-            _check(Path(table.output))
+        if self.parameters.output:
+            _check(Path(self.parameters.output))
         self._console = Console()
         self._live: Live | None = None
         if self._console.is_terminal:
@@ -94,16 +89,12 @@ class Monitor(AnserNode):
         self._last_s = time.monotonic()
         self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, qos.EVENTS)
-        period_s = table.period_s if self._live else LINE_PERIOD_S
+        period_s = PERIOD_S if self._live else LINE_PERIOD_S
         self.create_timer(period_s, self._show, clock=self.steady_clock)
-
-        if self._live is None and table.compare and table.compare_note:
-            print(f'{table.compare}: {table.compare_note}', flush=True)
 
     def _on_setup(self, message: String) -> None:
         setup = parse_setup(message.data)
-        known = self._setup
-        self._setup = setup
+        known, self._setup = self._setup, setup
         if known is not None and known.sensors == setup.sensors:
             return
         for subscription in self._pose_subscriptions:
@@ -232,8 +223,6 @@ class Monitor(AnserNode):
             caption = f'metal {100 * self._metal[-1][1]:.0f} cm from the board; {caption}'
         if self._first_s is not None:  # until then they are in the title
             caption += ''.join(f'\n{escape(text)}' for text in self._causes())
-        if self.parameters.compare and self.parameters.compare_note:
-            caption += f'\n{self.parameters.compare}: {self.parameters.compare_note}'
         return caption
 
     def _line(self, rows: dict[str, list[Row]]) -> str:
@@ -253,8 +242,7 @@ class Monitor(AnserNode):
         parts.append(f'{_number(1e3 * middle([row.latency_s for row in live]), 1)} ms')
         if self._metal:
             parts.append(f'metal {100 * self._metal[-1][1]:.0f} cm')
-        why = self._causes()
-        if why:
+        if why := self._causes():
             parts.append(f'why: {"; ".join(why)}')
         return '  '.join(parts)
 

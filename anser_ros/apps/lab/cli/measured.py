@@ -72,13 +72,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _present(shared: Path, console: Console) -> list[str]:
     """The data sets whose folders are there; says of the others that they are left out."""
-    names = []
-    for name, recipe in RECIPES.items():
-        if recipe.data(shared).is_dir():
-            names.append(name)
-        else:
-            console.print(f'{name} left out: no {recipe.data(shared)}', highlight=False)
-    return names
+    folders = {name: recipe.data(shared) for name, recipe in RECIPES.items()}
+    for name, folder in folders.items():
+        if not folder.is_dir():
+            console.print(f'{name} left out: no {folder}', highlight=False)
+    return [name for name, folder in folders.items() if folder.is_dir()]
 
 
 def _cook(
@@ -130,13 +128,11 @@ def table(rows: list[ReportRow]) -> Table:
         out.add_column(heading, justify='right' if heading in figures else 'left', overflow='fold')
     for row in rows:
         met = {None: '', True: 'yes', False: 'no'}[row.met]
-        values = [_number(value) for value in (row.before, row.after, row.special, row.target)]
-        values = [f'{value} {row.unit}'.strip() if value else '' for value in values]
-        out.add_row(row.dataset, row.figure, *values, met, row.chosen_on)
+        values = (row.before, row.after, row.special, row.target)
+        shown = [_number(value, row.unit) for value in values]
+        out.add_row(row.dataset, row.figure, *shown, met, row.chosen_on)
     return out
 
 
-def _number(value: float | None) -> str:
-    if value is None or not math.isfinite(value):
-        return ''
-    return f'{value:.8f}' if 0.99 < value < 1.0 else f'{value:.3g}'
+def _number(value: float | None, unit: str) -> str:
+    return '' if value is None or math.isnan(value) else f'{value:.3g} {unit}'.strip()
