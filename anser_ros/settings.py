@@ -1,7 +1,7 @@
 """Defines what an installation may state about itself: its accuracy, and how the refit follows.
 
-A value's name is the key in the setup document, the parameter of a node, and the NAME in ``--set
-NAME=VALUE``. Options and parameters go before the document, and that before the default.
+A value's name is the key in the setup document, and the NAME in ``--set NAME=VALUE``. Options go
+before the document, and that before the default.
 """
 
 import math
@@ -15,9 +15,9 @@ from anser_ros.arrays import Array
 from anser_ros.errors import ParameterError
 
 
-def _value(default: float, meaning: str, low: float, high: float) -> Any:
-    """A value that may be stated: its default, its meaning in a line, and its range."""
-    return field(default=default, metadata={'meaning': meaning, 'low': low, 'high': high})
+def _value(default: float, low: float, high: float) -> Any:
+    """A value that may be stated: its default and its range."""
+    return field(default=default, metadata={'low': low, 'high': high})
 
 
 @dataclass(frozen=True)
@@ -51,24 +51,17 @@ class Accuracy(_Stated):
     like an effect or metal; too large, these are hidden and poses have too large a sigma.
     """
 
-    # Where the noise is measured (the refit, the tracker's adaptive scale, the calibration), the
-    # estimate starts here.
-    flux_noise_t: float = _value(60e-12, 'noise of a phasor component, T', 1e-15, 1e-3)
-    # Of optical poses after interpolation to the fluxes' stamps.
-    optical_position_m: float = _value(
-        0.07e-3, 'jitter of an optical position along each axis, m', 0.0, 0.1
-    )
-    optical_rotation_rad: float = _value(
-        0.4e-3, 'jitter of an optical orientation about each axis, rad', 0.0, 1.0
-    )
-    reference_position_m: float = _value(
-        0.2e-3, "error of a reference sensor's surveyed place along each axis, m", 0.0, 0.1
-    )
-    reference_axis_rad: float = _value(
-        math.radians(0.3), "error of a reference sensor's surveyed axis, rad a tangent", 0.0, 1.0
-    )
-    reference_gain: float = _value(0.004, "relative error of a reference sensor's gain", 0.0, 1.0)
-    stamp_sigma_s: float = _value(0.3e-3, 'error of a flux stamp, s', 0.0, 0.1)
+    # Noise of a phasor component. Where it is measured (the refit, the tracker's adaptive scale,
+    # the calibration), the estimate starts here.
+    flux_noise_t: float = _value(60e-12, 1e-15, 1e-3)
+    # Jitter of an optical pose along and about each axis, interpolated to the fluxes' stamps.
+    optical_position_m: float = _value(0.07e-3, 0.0, 0.1)
+    optical_rotation_rad: float = _value(0.4e-3, 0.0, 1.0)
+    # Errors of a reference's surveyed place (each axis), axis (a tangent) and gain (relative).
+    reference_position_m: float = _value(0.2e-3, 0.0, 0.1)
+    reference_axis_rad: float = _value(math.radians(0.3), 0.0, 1.0)
+    reference_gain: float = _value(0.004, 0.0, 1.0)
+    stamp_sigma_s: float = _value(0.3e-3, 0.0, 0.1)  # error of a flux stamp
 
     @property
     def pose_jitter(self) -> Array:
@@ -80,57 +73,45 @@ class Accuracy(_Stated):
 class ToolSettings(_Stated):
     """States how well tools are known, and how fast they may be."""
 
-    # Too small, and faultless coils contradict their body; too large, and a coil may be wrong by
-    # some times this before its body notices.
-    tool_coil_position_m: float = _value(
-        0.12e-3, "error of a tool coil's place along each axis, m", 0.0, 0.1
-    )
-    tool_coil_axis_rad: float = _value(
-        math.radians(0.5), "error of a tool coil's axis, rad a tangent", 0.0, 1.0
-    )
-    tool_coil_gain: float = _value(0.002, "relative error of a tool coil's gain", 0.0, 1.0)
+    # Errors of a tool coil's place (each axis), axis (a tangent) and gain (relative). Too small,
+    # and faultless coils contradict their body; too large, and a coil may be wrong by some times
+    # this before its body notices.
+    tool_coil_position_m: float = _value(0.12e-3, 0.0, 0.1)
+    tool_coil_axis_rad: float = _value(math.radians(0.5), 0.0, 1.0)
+    tool_coil_gain: float = _value(0.002, 0.0, 1.0)
     # Poses that would take more are not published until the frames after them confirm them. The
     # defaults are a hand's: it reaches over a table at 1 to 1.5 m/s, and jerks at 3 g. Too small,
     # and fast movements lose frames; too large, and wrong poses look like movements.
-    max_speed_m_s: float = _value(2.0, 'largest speed of a tool, m/s', 1e-3, 1e4)
-    max_acceleration_m_s2: float = _value(40.0, 'largest acceleration of a tool, m/s^2', 1e-3, 1e6)
+    max_speed_m_s: float = _value(2.0, 1e-3, 1e4)
+    max_acceleration_m_s2: float = _value(40.0, 1e-3, 1e6)
 
 
 @dataclass(frozen=True)
 class RefitSettings(_Stated):
     """States how the live refit follows; nothing here belongs to a particular board or metal."""
 
-    # The current has a gain error of its own. A larger deviation lets a change of one emitter
-    # explain more of what metal does.
-    emitter_drift: float = _value(
-        0.003, "deviation of an emitter's strength relative to its measured current", 0.0, 1.0
-    )
-    # Eight emitters give eight complex readings per sensor; with fewer than four sensors the
-    # place of metal is open.
-    min_references: int = _value(
-        4, 'usable reference sensors below which poses are withheld', 1, 10_000
-    )
-    # More make the refit quieter at rest; movement ends the average at once.
-    average_frames: int = _value(
-        5, 'most frames that unchanging readings are averaged over', 1, 10_000
-    )
-    # The closer to 1, the longer a fresh hypothesis waits for its evidence.
-    persistence: float = _value(
-        0.98, 'probability that a hypothesis still holds in the next frame', 0.01, 0.9999
-    )
-    # 25 are half a second at 50 Hz.
-    hold_frames: int = _value(
-        25, 'frames of agreement after which a sensor left out is used again', 1, 1_000_000
-    )
-    # A C-arm that comes at 10 cm/s is 5 cm nearer after half a second, and metal that comes again
-    # has not come far. Shorter, and a hiccup of the line costs poses; longer, and poses are given
-    # without evidence.
-    references_age_s: float = _value(
-        0.5, 'longest time for which poses are given without references, s', 0.02, 60.0
-    )
-    # Fewer are cheaper to send and to use; what they leave out is added as noise.
-    error_modes: int = _value(12, "rank of the model's uncertainty", 1, 96)
-    seed: int = _value(1, 'seed of the draws that the uncertainty is made from', 1, 2**31)
+    # Deviation of an emitter's strength relative to its measured current, which has a gain error
+    # of its own. A larger one lets a change of one emitter explain more of what metal does.
+    emitter_drift: float = _value(0.003, 0.0, 1.0)
+    # Usable sensors below which poses are withheld. Eight emitters give eight complex readings per
+    # sensor; with fewer than four sensors the place of metal is open.
+    min_references: int = _value(4, 1, 10_000)
+    # Most frames that unchanging readings are averaged over. More make the refit quieter at rest;
+    # movement ends the average at once.
+    average_frames: int = _value(5, 1, 10_000)
+    # Probability that a hypothesis still holds in the next frame. The closer to 1, the longer a
+    # fresh one waits for its evidence.
+    persistence: float = _value(0.98, 0.01, 0.9999)
+    # Frames of agreement after which a sensor left out is used again, half a second at 50 Hz.
+    hold_frames: int = _value(25, 1, 1_000_000)
+    # Longest time for which poses are given without references. A C-arm that comes at 10 cm/s is
+    # 5 cm nearer after half a second, and metal that comes again has not come far. Shorter, and a
+    # hiccup of the line costs poses; longer, and poses are given without evidence.
+    references_age_s: float = _value(0.5, 0.02, 60.0)
+    # Rank of the model's uncertainty. Fewer are cheaper to send and to use; what they leave out is
+    # added as noise.
+    error_modes: int = _value(12, 1, 96)
+    seed: int = _value(1, 1, 2**31)  # of the draws that the uncertainty is made from
     accuracy: Accuracy = field(default_factory=Accuracy)
     # The refit itself has no use for tools: settings that differ in them only are the same.
     tools: ToolSettings = field(default_factory=ToolSettings, compare=False)

@@ -22,9 +22,9 @@ FIRST_NS = 1_750_000_000_000_000_000
 STEP_NS = 20_000_000
 
 
-def setup_text(world):
+def setup_text(world, **stated):
     """The test's world as a setup document."""
-    return dump_setup(setup_of(world.references))
+    return dump_setup(setup_of(world.references).with_stated(stated))
 
 
 class Rig:

@@ -277,7 +277,8 @@ def test_markers_of_nothing_and_of_one_source(ros):
 
 
 def test_lost_references_are_told_to_the_trackers_and_to_the_operator(make):
-    rig, intake, given = make(references_age_s=2.0, refit_rate_hz=1000.0), ModelIntake(), []
+    rig, intake, given = make(refit_rate_hz=1000.0), ModelIntake(), []
+    rig.node._on_setup(String(data=setup_text(rig.world, references_age_s=2.0)))
     rig.node._output.errors.publish = lambda message: intake.take_error(message_of(message))
     rig.node._output.models.publish = lambda message: given.append(
         intake.take(message_of(message))

@@ -2,7 +2,7 @@
 
 import argparse
 from copy import copy
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,9 +13,6 @@ from test_setup import document
 
 from anser_ros.cli import calibrate, diagnose, evaluate
 from anser_ros.errors import ParameterError, SetupError
-from anser_ros.nodes.field_model import FieldModelParameters
-from anser_ros.nodes.runtime.parameters import stated_by
-from anser_ros.nodes.tracker import TrackerParameters
 from anser_ros.refit.prior import UPRIGHT, build_prior
 from anser_ros.sessions.diagnosis import spread_of
 from anser_ros.sessions.prepared import prepare
@@ -269,25 +266,3 @@ class TestCommands:
             series = next(iter(found.sensors.values()))
             sigma.append(series.estimates[0].sigma_position_m)
         assert sigma[1] > 1.05 * sigma[0]
-
-
-class TestNodes:
-    @pytest.mark.parametrize(
-        ('table', 'names'),
-        [
-            (FieldModelParameters, {*VALUES} - {*SECTIONS['tools'], *OPTICAL, 'stamp_sigma_s'}),
-            (
-                TrackerParameters,
-                {'flux_noise_t', 'stamp_sigma_s', 'references_age_s', *SECTIONS['tools']},
-            ),
-        ],
-    )
-    def test_parameters_state_what_their_node_uses(self, table, names):
-        assert {f.name for f in fields(table)} & {*VALUES} == names
-        assert stated_by(table()) == {}
-        values = {name: OTHER[name] for name in names}
-        assert stated_by(table(**values)) == values
-
-    def test_a_value_out_of_range_is_refused_at_the_start(self):
-        with pytest.raises(ParameterError, match='flux_noise_t must be in'):
-            stated_by(TrackerParameters(flux_noise_t=1e-20))

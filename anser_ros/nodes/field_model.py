@@ -19,7 +19,7 @@ from anser_ros.frames.intake import Frame, Intake
 from anser_ros.nodes import field_model_io, field_model_refit
 from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import parameter, prefix_parameter, stated, stated_by
+from anser_ros.nodes.runtime.parameters import parameter, prefix_parameter
 from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.streams.clouds import GivenModel, read_frame, readings_of
 from anser_ros.nodes.streams.one_source import LOOK_S, NewestSource, sender_words, setup_source
@@ -79,18 +79,6 @@ class FieldModelParameters:
     save_file: str = parameter(
         'field_model.yaml', 'where the service save writes the model', live=True
     )
-    flux_noise_t: float = stated('flux_noise_t')
-    reference_position_m: float = stated('reference_position_m')
-    reference_axis_rad: float = stated('reference_axis_rad')
-    reference_gain: float = stated('reference_gain')
-    emitter_drift: float = stated('emitter_drift')
-    min_references: int = stated('min_references')
-    average_frames: int = stated('average_frames')
-    persistence: float = stated('persistence')
-    hold_frames: int = stated('hold_frames')
-    references_age_s: float = stated('references_age_s')
-    error_modes: int = stated('error_modes')
-    seed: int = stated('seed')
 
 
 LONGEST_WAIT_S = 0.004
@@ -112,7 +100,6 @@ class FieldModelNode(AnserNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         table = self.parameters
-        self._stated = stated_by(table)
         self._file_model = model_of(table.model_file)
         self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
         if self._baseline_bag is not None and self._baseline_bag.lost:
@@ -163,7 +150,7 @@ class FieldModelNode(AnserNode):
         if message.data == self._setup_text:
             return
         try:
-            setup = parse_setup(message.data).with_stated(self._stated)
+            setup = parse_setup(message.data)
             if self._setup is not None and setup.follows_as(self._setup) and not self._unfit:
                 self._setup_text, self._setup = message.data, setup
                 return  # another rate or noise: model and baseline hold

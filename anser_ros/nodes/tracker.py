@@ -34,8 +34,6 @@ from anser_ros.nodes.runtime.parameters import (
     STALE_AFTER_S,
     parameter,
     prefix_parameter,
-    stated,
-    stated_by,
 )  # fmt: skip
 from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.streams import one_source
@@ -79,14 +77,6 @@ class TrackerParameters:
     allow_uncalibrated: bool = parameter(
         False, 'whether poses are given by the nominal model though field_model withholds them'
     )
-    flux_noise_t: float = stated('flux_noise_t')
-    stamp_sigma_s: float = stated('stamp_sigma_s')
-    references_age_s: float = stated('references_age_s')
-    tool_coil_position_m: float = stated('tool_coil_position_m')
-    tool_coil_axis_rad: float = stated('tool_coil_axis_rad')
-    tool_coil_gain: float = stated('tool_coil_gain')
-    max_speed_m_s: float = stated('max_speed_m_s')
-    max_acceleration_m_s2: float = stated('max_acceleration_m_s2')
     adaptive: bool = parameter(
         TrackerSettings.adaptive,
         'whether the noise follows the residuals of good poses',
@@ -160,7 +150,6 @@ class TrackerNode(AnserNode):
         super().__init__(**options)
         table = self.parameters
         self._settings = settings_of(table)
-        self._stated = stated_by(table)
         self._file_model = model_of(table.model_file)
         self._file_tips = tips_of_file(table.tips_file)
         self._tips: dict[str, Tip] = {}
@@ -206,7 +195,7 @@ class TrackerNode(AnserNode):
         if message.data == self._setup_text:
             return
         try:
-            setup = parse_setup(message.data).with_stated(self._stated)
+            setup = parse_setup(message.data)
             setup = setup.with_tips(self._file_tips)
             known = self._setup
             if known is not None and setup.follows_as(known) and setup.tips == known.tips:

@@ -17,7 +17,6 @@ from typing import Any
 import yaml
 
 from anser_ros.errors import ParameterError
-from anser_ros.settings import VALUES, settings_from
 from anser_ros.wire.recorded import OPTICAL, TRACKED
 from anser_ros.wire.text_files import config_path, read_config, read_text, read_yaml
 
@@ -131,25 +130,6 @@ def describe(table: type) -> str:
         notes += ' (may change while it runs)' if rule.live else ''
         lines.append(f'  {field.name} = {default!r}{notes}\n      {rule.description}')
     return '\n'.join(lines) or '  none'
-
-
-def stated(name: str) -> Any:
-    """Return the field of a parameter table for a value of `VALUES`; see `parameter`."""
-    item = VALUES[name]
-    meaning, high = item.metadata['meaning'], item.metadata['high']
-    text = f'{meaning}; 0 for that of the setup document, or {item.default:.4g} without one'
-    return parameter(item.type(0), text, within=(0.0, high))  # type: ignore[operator]
-
-
-def stated_by(table: Any) -> dict[str, float]:
-    """Return the values that a node's parameters state, without those that are 0.
-
-    Raises `ParameterError` when a value is out of its range.
-    """
-    names = [field.name for field in dataclasses.fields(table) if field.name in VALUES]
-    values = {name: getattr(table, name) for name in names if getattr(table, name) != 0}
-    settings_from(values)
-    return values
 
 
 STALE_AFTER_S = 0.3

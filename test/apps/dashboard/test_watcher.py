@@ -1,6 +1,6 @@
 """The watch over the last seconds: what it finds, on what, and that its word goes out again."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,16 +10,14 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import String
 
 from anser_ros.apps.dashboard import watch as watching
-from anser_ros.apps.dashboard.nodes.watcher import Watcher, WatcherParameters
+from anser_ros.apps.dashboard.nodes.watcher import Watcher
 from anser_ros.apps.dashboard.watch import LIVE, OPTICAL, RIGID, SlidingWindow, Watch
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import EffectRecord
-from anser_ros.nodes.runtime.parameters import stated_by
 from anser_ros.nodes.streams.clouds import flux_cloud
 from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import empty_session, load_session
 from anser_ros.sessions.starting_model import load_model
-from anser_ros.settings import SECTIONS, VALUES
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.bag_writer import SessionWriter
@@ -282,9 +280,3 @@ def test_a_baseline_that_is_none_is_refused(start):
     watcher = start('watcher', '--ros-args', '-p', 'baseline_file:=nowhere.mcap')
     assert watcher.wait() == 2
     assert 'no such bag' in watcher.output
-
-
-def test_its_parameters_state_the_accuracy_that_it_uses():
-    names = {*SECTIONS['accuracy']} - {'stamp_sigma_s'}
-    assert {item.name for item in fields(WatcherParameters)} & {*VALUES} == names
-    assert stated_by(WatcherParameters(flux_noise_t=1e-10)) == {'flux_noise_t': 1e-10}

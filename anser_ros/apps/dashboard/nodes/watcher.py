@@ -26,7 +26,7 @@ from anser_ros.nodes.operator_words import (
 )
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import optical_parameter, parameter, stated, stated_by
+from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.streams.clouds import read_frame
 from anser_ros.nodes.streams.one_source import OneSource, sender_words, setup_source
@@ -76,12 +76,6 @@ class WatcherParameters:
     cpu_share: float = parameter(
         0.2, 'largest share of one processor on average', within=(0.01, 1.0), live=True
     )
-    flux_noise_t: float = stated('flux_noise_t')
-    optical_position_m: float = stated('optical_position_m')
-    optical_rotation_rad: float = stated('optical_rotation_rad')
-    reference_position_m: float = stated('reference_position_m')
-    reference_axis_rad: float = stated('reference_axis_rad')
-    reference_gain: float = stated('reference_gain')
 
 
 class Streams(Protocol):
@@ -111,7 +105,7 @@ class FluxStreams:
     WHAT = 'fluxes'
 
     def __init__(self, node: 'Watcher', table: WatcherParameters) -> None:
-        self._node, self._stated = node, stated_by(table)
+        self._node = node
         if table.model_file != NOMINAL:
             load_model(table.model_file)  # refused now, not when fluxes come
         self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
@@ -143,7 +137,7 @@ class FluxStreams:
 
         Raises `AnserError` when the text is not a setup, or model or baseline do not fit it.
         """
-        setup, table = parse_setup(text).with_stated(self._stated), self._node.parameters
+        setup, table = parse_setup(text), self._node.parameters
         # An empty window has a session's setup already, and a model must fit that.
         empty = empty_session(setup, LIVE)
         prepared = prepare(empty, model_for(table.model_file, empty), self._baseline_bag)
