@@ -302,6 +302,15 @@ class TestStream:
         assert not any(self.push(stream, k, 900) for k in range(121, 1000))
         assert stream.withheld > 20 and stream.clock.wants_answer
 
+    def test_an_answer_behind_lost_blocks_moves_no_stamps(self):
+        """A full line drops blocks, but no answer, and all that it carries is as late."""
+        stream = new_stream()
+        assert len(self.frames(stream, 100)) == 5
+        assert not any(self.push(stream, k, 100) for k in range(100, 300))
+        stream.answered(10**12 + 449 * 10**6)
+        assert not any(self.push(stream, k, 100) for k in range(450, 3700))
+        assert stream.clock.jumps == 0 and stream.clock.wants_answer
+
     def test_most_of_a_window_is_looked_at_before_its_end(self):
         """What repeats itself is searched for while the last blocks are still to come."""
         stream = new_stream()

@@ -125,6 +125,7 @@ class FluxStream:
         self._cutter = WindowCutter(window, hop, self._watch, self.ticks)
         self.counters = self._cutter.counters
         self.clock = SampleClock(rate)
+        self._asked_ns: int | None = None
         # Each with its middle and end in samples, and when its last block arrived, ns.
         self._waiting: deque[tuple[FluxFrame, float, float, int]] = deque()
         self.withheld = 0
@@ -159,8 +160,11 @@ class FluxStream:
             self.clock.bound(0, sent_ns)
 
     def answered(self, sent_ns: int) -> None:
-        """Take in that the device has just answered a command that was sent at a host time."""
-        self.clock.bound(self._cutter.end_sample + self._block_samples, sent_ns)
+        """Take in that the device has just answered a command that was sent at a host time.
+
+        It took the next block's last sample later; blocks between the two may be lost.
+        """
+        self._asked_ns = sent_ns
 
     def run_length(self, blocks: Sequence[SampleBlock]) -> int:
         """Return how many blocks to push at once: they follow, up to the end of a window."""
@@ -194,6 +198,9 @@ class FluxStream:
             self._begin()
         # What comes twice says nothing about now, and of blocks read together the newest says all.
         newest = self._cutter.end_sample
+        if self._asked_ns is not None and newest != before:
+            self.clock.bound(newest - (len(blocks) - 1) * self._block_samples, self._asked_ns)
+            self._asked_ns = None
         for left in range(len(blocks) - 1, 0, -1):
             if arrivals_ns[-left - 1] != arrivals_ns[-left] and not repeated:
                 self.clock.observe(newest - left * self._block_samples, arrivals_ns[-left - 1])
@@ -234,7 +241,7 @@ class FluxStream:
         """Withhold all that wait, whose samples belong to a stream that has ended."""
         self.withheld += len(self._waiting)
         self._waiting.clear()
-        self._begun = None
+        self._begun = self._asked_ns = None
         self.clock.restart()
 
     def _converter_of(self, hello: Hello, calibration: ChannelCalibration) -> FluxConverter:

@@ -165,14 +165,22 @@ class CuSimulator(AnserNode):
     def _step(self) -> None:
         """Send what is due. The next stretch is worked out before its time, so nothing is late.
 
-        If it is late nevertheless, on a busy machine, commands wait until the samples before them
-        have been sent, and answers follow these, because the host dates samples by the answers.
+        If it is late nevertheless, on a busy machine, answers follow the samples that were due
+        before the commands had been read, because the host dates samples by the answers.
         """
         unit = self._unit
-        now_s = self._elapsed_s()
+        # In this order, for this may wait for the processor in between.
+        commands, now_s = self._port.read(), self._elapsed_s()
         self._plug(now_s)
         unit.overload(self._injector.lasts(now_s, line.SATURATION))
-        answers = unit.receive(self._port.read()) if self._due_s(unit.samples) >= now_s else []
+        while now_s >= self._due_s(unit.samples) - STRETCH_S:
+            late_s = now_s - self._due_s(unit.samples) - LONGEST_LAG_S
+            if late_s > 0:
+                # The machine was too busy: samples are lost, as in a device, but time goes on.
+                self.count('lags')
+                unit.skip(int(late_s * unit.sample_rate_hz))
+            self._prepared.extend(unit.advance(round(STRETCH_S * unit.sample_rate_hz)))
+        answers = unit.receive(commands)
         if unit.streaming and self._stream_begin_s == math.inf:
             self._stream_begin_s = now_s
         due = []
@@ -182,13 +190,6 @@ class CuSimulator(AnserNode):
         if due and due[-1].is_block:
             due_ns = self._begin_ns + round(1e9 * self._due_s(due[-1].end_sample))
             self._least_late_ns = min(self._least_late_ns, time.monotonic_ns() - due_ns)
-        if now_s >= self._due_s(unit.samples) - STRETCH_S:
-            late_s = now_s - self._due_s(unit.samples) - LONGEST_LAG_S
-            if late_s > 0:
-                # The machine was too busy: samples are lost, as in a device, but time goes on.
-                self.count('lags')
-                unit.skip(int(late_s * unit.sample_rate_hz))
-            self._prepared.extend(unit.advance(round(STRETCH_S * unit.sample_rate_hz)))
 
     def _send(self, pieces: list[Piece], now_s: float) -> None:
         arriving = self._injector.apply(pieces, now_s)
