@@ -114,6 +114,23 @@ def test_rows_are_read_as_they_were_written(tmp_path):
     assert load(tmp_path / 'chaos.json') == rows
 
 
+def test_a_part_of_the_trial_keeps_the_rows_of_the_others(tmp_path, monkeypatch):
+    import run
+    from table import Row, load, save
+
+    out, old = (
+        tmp_path / 'chaos.json',
+        Row('serial', 'torn', 'what', '', None, 4, 0, None, None, 0.1),
+    )
+    new = replace(old, group='files', name='bag-empty')
+    save(out, [old, replace(new, poses=3)])
+    monkeypatch.setattr(run, 'commanded', lambda command: new)
+    arguments = ['--only', 'bag-empty', '--keep', '--out', str(out)]
+    monkeypatch.setattr(sys, 'argv', ['run.py', *arguments])
+    assert run.main() == 0
+    assert load(out) == [new, old]
+
+
 def test_growth_is_a_trend_and_no_step():
     from soak import Series
 

@@ -10,13 +10,14 @@ from tracking_world import NOISE_T, fluxes
 from anser_ros import pose_states as states
 from anser_ros.errors import TrackingError
 from anser_ros.frames.intake import Freshness, Intake
-from anser_ros.integrity.pose_checks import Continuity, MotionBounds, Place
+from anser_ros.integrity.pose_checks import Continuity, Place
 from anser_ros.physics.rotations import rotation_of_vector
+from anser_ros.settings import ToolSettings
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 
 SEED = 7
-HANDS = MotionBounds(2.0, 40.0)
+HANDS = ToolSettings()
 FAULT = 30
 
 
@@ -208,7 +209,7 @@ def test_a_leap_waits_for_three_frames_and_a_jerk_too():
     assert all(judged(smooth))
     jerk = [0.0, 0.0, 0.0, 0.030, 0.060]
     assert judged(jerk) == [True, True, True, False, False], 'below 2 m/s, above 40 m/s^2'
-    assert all(judged(jerk, MotionBounds(2.0, 200.0)))
+    assert all(judged(jerk, ToolSettings(max_acceleration_m_s2=200.0)))
 
 
 # The model ------------------------------------------------------------------------------

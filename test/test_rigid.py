@@ -1,6 +1,6 @@
 """Rigid tools: exact poses, cold starts, common model errors, coils that are left out."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,6 @@ from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.tracking import body_track
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.rigid import BodyCoils, common_factor, solve_body, start_from_coils
 from anser_ros.tracking.solve import RealField, bounded_inverse
@@ -216,7 +215,36 @@ def test_the_opposite_place_around_a_source_is_ambiguous_where_nothing_tells_it(
         assert state != 'ok' or np.linalg.norm(body.position - position) < 1e-3
 
 
-@pytest.mark.parametrize(('readings', 'factor'), [(3, 25.0), (4, 1.0)])
-def test_a_pose_that_no_reading_judges_is_as_uncertain_as_a_misfit(readings, factor):
-    frame = SimpleNamespace(context=SimpleNamespace(readings=readings))
-    assert body_track._unjudged(SimpleNamespace(used=[0, 1]), frame) == factor
+def few(emitters):
+    return replace(
+        MODEL, moments=MODEL.moments[:, :emitters], emitters=MODEL.emitters[:emitters],
+        frequencies_hz=MODEL.frequencies_hz[:emitters],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(('emitters', 'coils', 'row'), [(5, 1, 0), (3, 2, -1)])
+def test_a_pose_that_no_reading_checks_is_not_given(emitters, coils, row):
+    """One emitter more leaves readings over; how many is said."""
+    for count in (emitters, emitters + 1):
+        tool, rng = TOOL.select(list(range(coils))), np.random.default_rng(SEED)
+        tracker = Tracker(few(count), tool, TrackerSettings(flux_noise_t=NOISE_T))
+        position, rotation = np.array([0.03, -0.02, 0.12]), rotation_of_vector([0.4, 0.3, 0.2])
+        for stamp_ns in (1, 2, 3):
+            flux = fluxes(few(count), tool, position, rotation, rng)
+            found = tracker.update(stamp_ns * 10**7, tool.channel, flux)[row]
+            assert found.checks == coils * count - (5 if row == 0 else 6)
+            assert (found.state == 'ok') == (found.checks > 0), found.reason
+
+
+def test_without_a_check_a_pose_that_goes_on_is_as_uncertain_as_a_misfit():
+    """A body of three coils loses one of them."""
+    tool, rng, sigma = TOOL.select([0, 1, 2]), np.random.default_rng(SEED), []
+    tracker = Tracker(few(3), tool, TrackerSettings(flux_noise_t=NOISE_T))
+    for stamp_ns in range(1, 7):
+        position, rotation = np.array([0.03, -0.02, 0.12]), rotation_of_vector([0.4, 0.3, 0.2])
+        flux = fluxes(few(3), tool, position, rotation, rng)
+        flux[2] = np.nan if stamp_ns > 3 else flux[2]
+        found = tracker.update(stamp_ns * 10**7, tool.channel, flux)[-1]
+        assert found.state == 'ok' and found.checks == (3 if stamp_ns < 4 else 0), found.reason
+        sigma.append(found.sigma_position_m)
+    assert min(sigma[3:]) > 4.0 * max(sigma[:3]), sigma

@@ -14,7 +14,6 @@ covariances (Hausman, Econometrica 1978), which the coil's own bounds from above
 import math
 from collections import deque
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +22,7 @@ from scipy.special import chdtri
 from anser_ros.arrays import Array, Booleans
 from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.rotations import fill_tangent
+from anser_ros.settings import ToolSettings
 from anser_ros.stamps import NANO
 
 STREAM_GAP_S = 0.5
@@ -47,13 +47,6 @@ SIGMAS = 3.0
 """Allowance for the poses' own errors, in units of `Place.sigma_m`, beside the bounds."""
 
 
-class MotionBounds(NamedTuple):
-    """Holds the largest speed (m/s) and acceleration (m/s^2) of a tool."""
-
-    speed_m_s: float
-    acceleration_m_s2: float
-
-
 class Place(NamedTuple):
     """States where something was, and how well that is known: stamp, position (m), its sigma,
     m."""
@@ -63,7 +56,7 @@ class Place(NamedTuple):
     sigma_m: float
 
 
-def motion_contradiction(before: list[Place], now: Place, bounds: MotionBounds) -> str:
+def motion_contradiction(before: list[Place], now: Place, tools: ToolSettings) -> str:
     """State how a place contradicts the places before it, oldest first; empty if it does not.
 
     Of the last two places and this one: for an acceleration of at most a, the place is no further
@@ -75,7 +68,7 @@ def motion_contradiction(before: list[Place], now: Place, bounds: MotionBounds) 
     dt = (now.stamp_ns - last.stamp_ns) * NANO
     away = math.dist(now.position, last.position)
     error = SIGMAS * math.hypot(now.sigma_m, last.sigma_m)
-    if away > bounds.speed_m_s * dt + error:
+    if away > tools.max_speed_m_s * dt + error:
         return f'{1e3 * away:.3g} mm in {1e3 * dt:.3g} ms is a speed of {away / dt:.3g} m/s'
     if len(before) < 2:
         return ''
@@ -86,7 +79,7 @@ def motion_contradiction(before: list[Place], now: Place, bounds: MotionBounds) 
     bent = math.dist(now.position, led)
     error = SIGMAS * math.hypot(now.sigma_m, (1.0 + steps) * last.sigma_m, steps * first.sigma_m)
     time = 0.5 * dt * (dt + dt_before)
-    if bent > bounds.acceleration_m_s2 * time + error:
+    if bent > tools.max_acceleration_m_s2 * time + error:
         return f'an acceleration of {bent / time:.3g} m/s^2'
     return ''
 
@@ -127,9 +120,7 @@ class Continuity:
         self._frames = self._began_ns = self._last_ns = self._refused = 0
         self._record: deque[tuple[int, bool]] = deque()
 
-    def judge(
-        self, stamp_ns: int, place: Place | None, refused: bool, bounds: MotionBounds
-    ) -> str:
+    def judge(self, stamp_ns: int, place: Place | None, refused: bool, tools: ToolSettings) -> str:
         """Return why the next frame's pose is not confirmed; empty where it is, or there is none.
 
         ``place`` is that of a pose that fits its own readings; ``refused`` says whether there is
@@ -153,12 +144,12 @@ class Continuity:
         if place is None:
             self._run, self._frames = [], 0
             return ''
-        contradiction = motion_contradiction(self._track, place, bounds)
+        contradiction = motion_contradiction(self._track, place, tools)
         old = not self._track or stamp_ns - self._track[-1].stamp_ns > RECORD_S / NANO
         if not (old or contradiction or self._refused > MOST_REFUSED * len(self._record)):
             self._track, self._frames = [self._track[-1], place], 0
             return ''
-        if not self._frames or motion_contradiction(self._run, place, bounds):
+        if not self._frames or motion_contradiction(self._run, place, tools):
             self._run, self._frames, self._began_ns = [], 0, stamp_ns
         self._run, self._frames = [*self._run[-1:], place], self._frames + 1
         if alone or self._is_confirmed(stamp_ns):
@@ -224,19 +215,6 @@ def is_part(offsets: Array, against: Collection[int], others: Collection[int]) -
     return bool(((apart**2).sum(axis=2) > APART_M**2).all())
 
 
-@dataclass(frozen=True)
-class SurveyErrors:
-    """Says how well a tool is known: its coils' places, m an axis, their axes, rad, and gains.
-
-    A field over a board falls with the third power of the distance, so that a coil whose gain is
-    wrong by g seems to be g/3 of its distance from the board elsewhere.
-    """
-
-    position_m: float
-    axis_rad: float
-    gain: float
-
-
 @inlined
 def _add_product(rows, covariance, total):  # type: ignore[no-untyped-def]
     """Add ``rows covariance rows^T`` of rows (m, n) to a matrix (m, m)."""
@@ -277,7 +255,8 @@ def fill_distances(  # type: ignore[no-untyped-def]
 
     ``position`` (3,), ``rotation`` (3, 3), ``covariance`` (6, 6): the body's. ``offsets``,
     ``axes`` (S, 3): the coils in the body. ``positions``, ``directions`` (S, 3), ``covariances``
-    (S, 6, 6): what the coils say. ``took_part`` (S,). ``survey`` (3,): m, rad, relative gain.
+    (S, 6, 6): what the coils say. ``took_part`` (S,). ``survey`` (3,): m, rad, relative gain, of
+    which a third seems to be a change of the distance: a field falls with its third power.
     """
     t, slopes, total = np.empty((2, 3)), np.zeros((2, 5, 6)), np.empty((5, 5))
     apart, arm, n, cross = np.empty(5), np.empty(3), np.empty(3), np.empty(3)
@@ -320,7 +299,7 @@ def distances(
     axes: Array,
     coils: tuple[Array, Array, Array],
     took_part: Booleans,
-    survey: SurveyErrors,
+    tools: ToolSettings,
 ) -> Array:
     """Return how far each coil's own pose is from its place in the body, (3, S).
 
@@ -331,8 +310,8 @@ def distances(
     ``took_part`` (S,) is whether the body's pose made use of the coil.
     """
     found = np.empty((3, len(offsets)))
-    survey_errors = np.array([survey.position_m, survey.axis_rad, survey.gain])
-    fill_distances(*body, offsets, axes, *coils, took_part, survey_errors, found)
+    survey = tools.tool_coil_position_m, tools.tool_coil_axis_rad, tools.tool_coil_gain
+    fill_distances(*body, offsets, axes, *coils, took_part, np.array(survey), found)
     return found
 
 

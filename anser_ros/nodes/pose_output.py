@@ -153,6 +153,7 @@ class PoseTopic:
             'sigma_position_m': estimate.sigma_position_m,
             'residual_t': estimate.residual_t,
             'chi2_per_freedom': estimate.chi2,
+            'checks': estimate.checks,
             'model': estimate.model_id,
         }
         values.update({f'{FRAMES_IN}{name}': count for name, count in sorted(self.states.items())})

@@ -62,6 +62,7 @@ class FrameMotion:
         columns[0], columns[-1, 0] = np.concatenate(whole), COMMON_GAIN * drawn.flux
         for k in range(len(emitters)):
             columns[1 + k, :3, :, k] = -whole[0][:, :, k]
+            columns[1 + k, 3, :, k] = COMMON_GAIN * drawn.flux[:, k]  # it may be weaker as well
         self._things = len(columns)
         self._columns = columns.reshape(6 * len(columns), -1).T / noise_t  # a row for a reading
 
@@ -111,11 +112,12 @@ class FrameMotion:
         """Return how far a motion (6,) takes the references, or an emitter, where that is certain
         and too far until the next look.
         """
-        shift, turn = PRIOR_M * motion[:3], PRIOR_RAD * motion[3:]
+        kinds = 3 if what else 6  # an emitter's fourth factor is its strength
+        shift, turn = PRIOR_M * motion[:3], PRIOR_RAD * motion[3:] * (what == 0)
         away = float(np.linalg.norm(shift + np.cross(turn, self._points), axis=1).max())
         before = self._away[1] if self._away[0] == what else 0.0
         self._away = what, away
-        is_certain = (np.abs(motion) > FAR_SIGMAS * sigma).any()
+        is_certain = (np.abs(motion) > FAR_SIGMAS * sigma)[:kinds].any()
         if not is_certain or max(away, 2.0 * away - before) < FAR_M:
             return ''
         words = ', '.join(f'{1e3 * v:+.1f}' for v in shift)

@@ -16,7 +16,7 @@ from anser_ros.tracking.coil_track import CoilResult
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve import bounded_inverse
-from anser_ros.tracking.solve_verdict import RARE, SYSTEMATIC, Freedom, SolveFrame
+from anser_ros.tracking.solve_verdict import RARE, Freedom, SolveFrame
 
 DISAGREES = 4.0
 """A coil is left out when its share of the misfit is so many times the mean of the others'."""
@@ -226,6 +226,7 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
         worst = next((c.estimate.state for c in frame.single if not c.usable), states.STALE)
         return BodyResult(frame.no_pose(worst, reason))
     fits = _from_good(track, frame, used)
+    continues = bool(fits)
     if not fits:
         fits = [_solve(frame, used, start) for start in _cold_starts(frame, used)]
         fits.sort(key=lambda candidate: candidate.ratio)
@@ -236,7 +237,7 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
     fits += _on_other_sides(frame, fits[0])
     fits.sort(key=lambda candidate: candidate.ratio)
     fit = fits[0]
-    result, gain = _judge(track, frame, fit, fits[1:])
+    result, gain = _judge(track, frame, fit, fits[1:], continues)
     if result.state == states.OK:
         track.remember(fit.solution, frame.stamp_ns)
         track.noise.add(fit.ratio)
@@ -286,13 +287,13 @@ def _from_good(track: BodyTrack, frame: BodyFrame, used: Integers) -> list[BodyF
 
 
 def _judge(
-    track: BodyTrack, frame: BodyFrame, fit: BodyFit, rivals: list[BodyFit]
+    track: BodyTrack, frame: BodyFrame, fit: BodyFit, rivals: list[BodyFit], continues: bool
 ) -> tuple[PoseEstimate, float]:
     """The estimate, and by how much a common gain may be off, the error of which it has too."""
     solution = fit.solution
     covariance = bounded_inverse(solution.information)
     gain, carried = solution.gain(covariance)
-    by_gain, factor = np.outer(gain * carried, gain * carried), _unjudged(fit, frame)
+    by_gain = np.outer(gain * carried, gain * carried)
     position, rotation = solution.position, solution.rotation
     others = (
         (rival.solution.chi2, 'another pose')
@@ -300,21 +301,18 @@ def _judge(
         if rival.solution.converged and _apart(rival.solution, solution)
     )
     estimate = frame.estimate(
-        track.noise, solution, Freedom(fit.freedom, UNKNOWNS, RARE),
-        (position, rotation[:, 2].copy(), rotation),
-        lambda scale: factor * covariance + by_gain / scale, others,
+        track.noise, solution,
+        Freedom(fit.freedom, UNKNOWNS, RARE, len(fit.used) * frame.context.readings - UNKNOWNS),
+        (position, rotation[:, 2].copy(), rotation), lambda scale: covariance + by_gain / scale,
+        others,
         position + rotation @ frame.coils.subset(fit.used).offsets.mean(axis=0),
+        continues=continues,
     )  # fmt: skip
     left_out = len(frame.single) - len(fit.used)
     if estimate.state == states.OK and left_out:
         reason = f'{left_out} of {len(frame.single)} coils left out'
         estimate = replace(estimate, reason=reason)
     return estimate, gain
-
-
-def _unjudged(fit: BodyFit, frame: BodyFrame) -> float:
-    """Return the factor on variances: that of a misfit where no reading is left to show one."""
-    return 1.0 if len(fit.used) * frame.context.readings > UNKNOWNS else SYSTEMATIC
 
 
 def _apart(one: rigid.BodySolution, other: rigid.BodySolution) -> bool:

@@ -17,7 +17,7 @@ from anser_ros.tracking.descent import descend
 from anser_ros.tracking.estimate import TrackerSettings, add_frame, scale_of_frame, sigma_factor
 from anser_ros.tracking.solve import MAX_EVALUATIONS, CoilSolution, coil_covariance
 from anser_ros.tracking.solve_context import fill_model_errors
-from anser_ros.tracking.solve_verdict import SOUND, SYSTEMATIC, fault_of, usual_and_most
+from anser_ros.tracking.solve_verdict import SOUND, SYSTEMATIC, Freedom, fault_of, usual_and_most
 
 SUSPICIOUS_JUMP_M = 0.02
 """A pose that moved further from one frame to the next, m, is confirmed by a scan, for it may be
@@ -279,18 +279,17 @@ def follow_coils(stamp_ns, values, sound, lengths, memory, model, rules, out):  
     return True
 
 
-def freedom_of(width: int) -> int:
-    """Return the degrees of freedom of the residual of so many flux components."""
-    return max(width - UNKNOWNS, 1)
+def freedom_of(width: int, readings: int) -> Freedom:
+    """Return what so many flux components, and readings among them, leave to a coil's pose."""
+    return Freedom(max(width - UNKNOWNS, 1), UNKNOWNS, SELDOM, readings - UNKNOWNS)
 
 
-def rules_of(settings: TrackerSettings, width: int) -> Rules:
-    """Return the rules for coils of so many flux components."""
-    freedom, box = freedom_of(width), settings.box
-    usual, most = usual_and_most(settings, freedom, SELDOM)
+def rules_of(settings: TrackerSettings, freedom: Freedom) -> Rules:
+    """Return the rules for coils of such a freedom."""
+    box, (usual, most) = settings.box, usual_and_most(settings, freedom)
     return Rules(
-        float(settings.gate), settings.has_gate, settings.adaptive, float(freedom), usual,
-        most, float(settings.warm_age_s),
+        float(settings.gate), settings.has_gate, settings.adaptive, float(freedom.of_residual),
+        usual, most, float(settings.warm_age_s),
         float(settings.min_signal), float(settings.roll_variance), float(settings.max_sigma_m),
         MAX_EVALUATIONS,
         (float(box.low[0]), float(box.low[1]), float(box.low[2])),

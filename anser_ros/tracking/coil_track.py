@@ -57,7 +57,7 @@ class CoilTracks:
     def __init__(self, count: int) -> None:
         self.scans = [Scans() for _ in range(count)]
         self._made_for: tuple[ErrorModes | None, Array] | None = None
-        self._ruled: tuple[TrackerSettings, int, coil_step.Rules] | None = None
+        self._ruled: tuple[TrackerSettings, Freedom, coil_step.Rules] | None = None
         noise = np.tile(FRESH_NOISE, (count, 1))
         self.noise = [NoiseScale(row) for row in noise]
         some, none = np.zeros((count, 6)), np.empty((count, 0, 0))
@@ -106,9 +106,9 @@ class CoilTracks:
     ) -> coil_step.Followed:
         """Solve all coils near where they are expected; see `follow_coils`."""
         out, memory = coil_step.Followed.empty(*values.shape), self.prepare(context)
-        ruled, width = self._ruled, values.shape[1]
-        if ruled is None or ruled[0] is not settings or ruled[1] != width:
-            ruled = self._ruled = settings, width, coil_step.rules_of(settings, width)
+        ruled, freedom = self._ruled, coil_step.freedom_of(values.shape[1], context.readings)
+        if ruled is None or ruled[0] is not settings or ruled[1] != freedom:
+            ruled = self._ruled = settings, freedom, coil_step.rules_of(settings, freedom)
         if context.readings >= coil_step.UNKNOWNS and not coil_step.follow_coils(
             stamp_ns, values, sound, lengths, memory, context.arrays, ruled[2], out
         ):
@@ -125,14 +125,9 @@ class CoilFrame(SolveFrame):
     tracks: CoilTracks
 
     @property
-    def freedom(self) -> int:
-        """Return the degrees of freedom of the residual."""
-        return coil_step.freedom_of(self.flux.size)
-
-    @property
-    def limit(self) -> float:
-        """Return the chi-square up to which a pose is accepted."""
-        return self.settings.gate**2 * self.freedom
+    def freedom(self) -> Freedom:
+        """Return what the readings leave to the pose."""
+        return coil_step.freedom_of(self.flux.size, self.context.readings)
 
     @property
     def among_metal(self) -> bool:
@@ -169,7 +164,7 @@ def track_coil(frame: CoilFrame, followed: coil_step.Followed) -> CoilResult:
         estimate = PoseEstimate(
             frame.name, frame.stamp_ns, states.OK, solution.position, solution.axis, None,
             followed.covariance[row], float(followed.residual_t[row]),
-            solution.chi2 / frame.freedom, context.model_id,
+            solution.chi2 / frame.freedom.of_residual, context.model_id, '', frame.freedom.checks,
         )  # fmt: skip
         return CoilResult(estimate, solution, False, frame.among_metal)
     if fault != coil_step.UNKNOWN:
@@ -198,7 +193,8 @@ def _cold(frame: CoilFrame, scans: Scans) -> list[CoilSolution]:
     context = frame.context
     # Far from the truth only the size of the model's error counts, not its pattern.
     power = float(np.mean((frame.flux / context.sigma) ** 2))
-    limit = frame.limit * (1.0 + context.relative_error**2 * power)
+    limit = frame.settings.gate**2 * frame.freedom.of_residual
+    limit *= 1.0 + context.relative_error**2 * power
     found = solve_cold(
         context.field, context.grid, frame.flux, whitening_of(context.sigma), context.low,
         context.high, frame.length, limit, thorough=scans.failures % THOROUGH_EVERY == 0,
@@ -237,7 +233,7 @@ def _scanned(
         _take_errors(frame, solution.position, solution.axis)
         coil_step.remember(
             frame.row, frame.stamp_ns, solution.position, solution.axis, solution.residual,
-            judged.chi2, float(frame.freedom), frame.tracks.memory,
+            judged.chi2, float(frame.freedom.of_residual), frame.tracks.memory,
         )  # fmt: skip
     else:
         wait_s = min(FIRST_RETRY_S * 2.0 ** min(scans.failures, 10), LAST_RETRY_S)
@@ -256,8 +252,7 @@ def _judge(
         if rival.converged and settings.box.contains(rival.position)
     )
     return frame.estimate(
-        frame.tracks.noise[frame.row], solution,
-        Freedom(frame.freedom, coil_step.UNKNOWNS, coil_step.SELDOM), (position, axis, None),
+        frame.tracks.noise[frame.row], solution, frame.freedom, (position, axis, None),
         lambda scale: coil_covariance(solution.normal, axis, settings.roll_variance / scale),
         others, position, in_metal=frame.among_metal,
     )  # fmt: skip

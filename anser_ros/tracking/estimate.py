@@ -136,6 +136,7 @@ class PoseEstimate:
     chi2: float  # Residual power per degree of freedom in units of the expected one
     model_id: str  # Which field model made it
     reason: str = ''  # Why the state is not ``ok``, in words with figures
+    checks: int = 0  # Readings beyond the pose's unknowns, which could contradict it
 
     @property
     def sigma_position_m(self) -> float:

@@ -7,7 +7,7 @@ the last seconds' unexplained is doubtful, though single poses pass by chance.
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,13 +15,7 @@ import numpy as np
 from anser_ros import pose_states as states
 from anser_ros.arrays import Integers
 from anser_ros.integrity import pose_checks
-from anser_ros.integrity.pose_checks import (
-    STREAM_GAP_S,
-    Continuity,
-    MotionBounds,
-    Place,
-    SurveyErrors,
-)
+from anser_ros.integrity.pose_checks import STREAM_GAP_S, Continuity, Place
 from anser_ros.stamps import NANO
 from anser_ros.tracking.body_track import BodyResult
 from anser_ros.tracking.coil_track import CoilResult
@@ -131,18 +125,20 @@ class Judgement:
     ) -> Estimates:
         """Return the estimates of a frame, sensors first, with what the checks say of them."""
         found = [result.estimate for result in coils]
+        alone = set(range(len(coils)))
         for body in bodies:
+            if body.result.fit is not None:
+                alone.difference_update(body.rows.tolist())
             if body.result.gain > 0.0:
-                _add_gain_error(found, coils, body)
+                _add_gain_error(found, coils, body.rows.tolist(), body.result.gain)
+        _add_gain_error(found, coils, alone, math.nan)
         of_bodies = [body.result.estimate for body in bodies]
         if settings.judges:
             of_bodies = [_judged_by_coils(found, body, settings) for body in bodies]
         found += of_bodies
         if settings.judges:
             self._add_to_record(stamp_ns, found[: len(coils)])
-            tools = settings.tools
-            bounds = MotionBounds(tools.max_speed_m_s, tools.max_acceleration_m_s2)
-            found = [self._judged_in_time(estimate, bounds) for estimate in found]
+            found = [self._judged_in_time(estimate, settings) for estimate in found]
             for i, body in enumerate(bodies):
                 self._take_alternating(found, [*body.rows.tolist(), len(coils) + i])
         for estimate in found:
@@ -156,7 +152,7 @@ class Judgement:
         typical = sorted(refused)[len(refused) // 2] if refused else math.nan
         self.record.add(stamp_ns, len(refused), total, typical)
 
-    def _judged_in_time(self, estimate: PoseEstimate, bounds: MotionBounds) -> PoseEstimate:
+    def _judged_in_time(self, estimate: PoseEstimate, settings: TrackerSettings) -> PoseEstimate:
         """The estimate, or why it is not given out: its own past, or that of the whole model."""
         place = None
         if estimate.state in (states.OK, states.INCONSISTENT):
@@ -166,7 +162,7 @@ class Judgement:
         if continuity is None:
             continuity = self._continuity[estimate.name] = Continuity()
         refused = estimate.state in CONTRADICTS
-        reason = continuity.judge(estimate.stamp_ns, place, refused, bounds)
+        reason = continuity.judge(estimate.stamp_ns, place, refused, settings.tools)
         if place is not None and not refused and self.record.is_doubtful:
             return replace(estimate, state=states.MODEL_DOUBTFUL, reason=self.record.reason)
         if reason:
@@ -201,12 +197,14 @@ class Judgement:
         )  # fmt: skip
 
 
-def _add_gain_error(found: Estimates, coils: Sequence[CoilResult], body: RigidBody) -> None:
-    """Add to the coils' covariances, in ``found``, what the gain does that they have in common."""
-    for row in body.rows.tolist():
+def _add_gain_error(
+    found: Estimates, coils: Sequence[CoilResult], rows: Iterable[int], gain: float
+) -> None:
+    """Add to some coils' covariances, in ``found``, what a common gain does, see `add_gain`."""
+    for row in rows:
         solution = coils[row].solution
         if solution is not None and found[row].state == states.OK:
-            add_gain(found[row].covariance, solution.normal, solution.axis, body.result.gain)
+            add_gain(found[row].covariance, solution.normal, solution.axis, gain)
 
 
 def _judged_by_coils(found: Estimates, body: RigidBody, settings: TrackerSettings) -> PoseEstimate:
@@ -254,7 +252,7 @@ def _contradictions(
             np.array([e.covariance for e in own]),
         ),
         np.array([i in used for i in members]),
-        SurveyErrors(tools.tool_coil_position_m, tools.tool_coil_axis_rad, tools.tool_coil_gain),
+        tools,
     )  # fmt: skip
     against = {}
     for i, one, (distance, away_m, angle) in zip(members, own, away.T.tolist(), strict=True):

@@ -28,7 +28,7 @@ from anser_ros.tracking.descent import (
     limit_step,
 )
 from anser_ros.tracking.seed import SeedGrid
-from anser_ros.tracking.solve import RealField
+from anser_ros.tracking.solve import COMMON_GAIN, LEAST_GAIN, RealField
 
 
 @inlined
@@ -251,14 +251,6 @@ class BodyCoils:
         if self.changes is None:
             return np.zeros((len(flux), 0, flux.shape[1]))
         return np.ascontiguousarray(self.changes.T[:, :, None] * flux[:, None, :])
-
-
-COMMON_GAIN = 0.01
-"""Standard deviation of a gain that all coils of a tool have in common, as by one amplifier or by
-the emitters' supply, before the coils say anything. Nine coils with eight emitters know it to 3e-4
-in one frame at 0.25 m."""
-LEAST_GAIN = 5e-4
-"""Common gain that nobody reckons with: it moves no pose by 0.1 mm, and its noise is 1e-4."""
 
 
 @dataclass(frozen=True)

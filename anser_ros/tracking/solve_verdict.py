@@ -31,11 +31,11 @@ It is smaller than that of a single coil, for many degrees of freedom make much 
 excess."""
 
 SYSTEMATIC = 25.0
-"""Factor on the variances of a pose whose misfit is more than noise where no gate refuses it, and
-of one that only a gate wider than the usual one lets pass. A wrong gain moves a pose further than
-noise of the same residual: by up to 8 of its sigmas with a factor of 4 (2 to 20 %, on one coil,
-simulated). Smaller, and 3 sigma do not hold there; larger, and poses that are asked for in spite
-of their misfit are called more uncertain than they are."""
+"""Factor on the variances of a pose whose misfit is more than noise where no gate refuses it, of
+one that only a gate wider than the usual one lets pass, and of one without a check. A wrong gain
+moves a pose further than noise of the same residual: by up to 8 of its sigmas with a factor of 4
+(2 to 20 %, on one coil, simulated). Smaller, and 3 sigma do not hold there; larger, and poses that
+are asked for in spite of their misfit are called more uncertain than they are."""
 
 
 SOUND, MISFIT, OUTSIDE, UNENDED, UNCERTAIN, IN_METAL = range(6)
@@ -56,12 +56,13 @@ def fault_of(ratio, gate, is_inside, converged, sigma_m, most_m, in_metal):  # t
     return IN_METAL if in_metal else SOUND
 
 
-def usual_and_most(settings: TrackerSettings, freedom: int, seldom: float) -> tuple[float, float]:
-    """Return residual powers per freedom: that which noise exceeds with a probability of
-    ``seldom``, and that beyond which a misfit is systematic.
+def usual_and_most(settings: TrackerSettings, freedom: 'Freedom') -> tuple[float, float]:
+    """Return residual powers per freedom: that which noise exceeds seldom, and that beyond which a
+    misfit is systematic; any may be where no reading is left to show one.
     """
-    usual = chi2_limit(freedom, seldom) / freedom
-    return usual, USUAL_GATE**2 if settings.has_gate else usual
+    usual = chi2_limit(freedom.of_residual, freedom.seldom) / freedom.of_residual
+    most = USUAL_GATE**2 if settings.has_gate else usual
+    return usual, most if freedom.checks > 0 else -1.0
 
 
 def millimetres(place: Array) -> str:
@@ -70,13 +71,15 @@ def millimetres(place: Array) -> str:
 
 
 class Freedom(NamedTuple):
-    """Degrees of freedom of a residual, the pose's unknowns, and the probability of a misfit
-    beyond which it counts as more than noise.
+    """Degrees of freedom of a residual, the pose's unknowns, the probability of a misfit beyond
+    which it counts as more than noise, and the checks: what the field makes of readings beyond
+    the unknowns, which alone can contradict the pose.
     """
 
     of_residual: int
     unknowns: int
     seldom: float
+    checks: int
 
 
 @dataclass
@@ -104,6 +107,7 @@ class SolveFrame:
         place: Array,
         what: str = 'position',
         in_metal: bool = False,
+        continues: bool = False,
     ) -> PoseEstimate:
         """Judge a solution by itself: its covariance, its state, and the reason for it.
 
@@ -113,7 +117,8 @@ class SolveFrame:
         body's coils, m, frame fg. ``rivals`` are other poses, the likeliest first: the chi-square
         of each, and its name in the reason; they are looked at only where the pose is good by
         itself. ``in_metal``: whether the pose lies among the dipoles that stand for metal, where
-        the model's field is none.
+        the model's field is none; ``continues``: whether it goes on from a good one, which is the
+        only check of a pose without readings to spare.
         """
         settings, ratio = self.settings, solution.chi2 / freedom.of_residual
         scale = self._variance_scale(noise, ratio, freedom)
@@ -141,20 +146,22 @@ class SolveFrame:
             reason = 'where there may be metal'
         else:
             most = solution.chi2 + settings.margin(ratio)
-            words = next((name for chi2, name in rivals if chi2 < most), '')
+            is_open = freedom.checks <= 0 and not continues and settings.has_gate
+            unknown = 'another pose, which no reading is left to exclude,' if is_open else ''
+            words = next((name for chi2, name in rivals if chi2 < most), unknown)
             reason = f'{words} would explain the fluxes too' if words else ''
             state = states.AMBIGUOUS if words else states.OK
         return PoseEstimate(
             self.name, self.stamp_ns, state, *pose, scaled, residual_t, ratio,
-            self.context.model_id, reason,
+            self.context.model_id, reason, freedom.checks,
         )  # fmt: skip
 
     def _variance_scale(self, noise: NoiseScale, ratio: float, freedom: Freedom) -> float:
         """Return the factor on the variances of a pose; 1 where the noise is not adapted."""
         if not self.settings.adaptive:
             return 1.0
-        of_residual, unknowns, seldom = freedom
-        usual, most = usual_and_most(self.settings, of_residual, seldom)
+        usual, most = usual_and_most(self.settings, freedom)
         share, follows = self.context.model_share, self.context.modes is not None
-        scale = noise.of_frame(ratio, usual, of_residual / unknowns, share, follows)
+        of_unknown = freedom.of_residual / freedom.unknowns
+        scale = noise.of_frame(ratio, usual, of_unknown, share, follows)
         return scale if ratio <= most else SYSTEMATIC * scale

@@ -23,7 +23,7 @@ from anser_ros.effects.correction import Correction
 from anser_ros.errors import TrackingError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import FAULTS, GOOD, STUCK_CODE, Frame, Freshness, Intake, value_codes
-from anser_ros.integrity.pose_checks import SurveyErrors, distances
+from anser_ros.integrity.pose_checks import distances
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import Withheld
@@ -411,5 +411,5 @@ def warm_up_bodies(model: FieldModel) -> None:
         )
         distances(
             (*body, np.eye(6)), coils.offsets, coils.axes, (*own, normals), took_part,
-            SurveyErrors(1e-4, 1e-3, 1e-3),
+            TrackerSettings().tools,
         )  # fmt: skip

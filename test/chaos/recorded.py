@@ -65,6 +65,7 @@ class Trial:
     refit: bool = True
     nominal: bool = False
     coils: tuple[int, ...] = ALL
+    kept: np.ndarray | bool = True  # which frames come at all, (F,)
 
     @property
     def after(self) -> np.ndarray:
@@ -150,10 +151,10 @@ def tracked(t: Trial) -> tuple[list[tuple[float, float]], Counter[str]]:
     tracking = TrackingHalf(Tracker(model, table, t.settings), SETUP.refit.references_age_s)
     chain, rows = Chain(half, tracking), {TOOL.name[c]: c for c in t.coils}
     found, states, no_flags = [], Counter[str](), np.zeros(len(REFERENCE), int)
-    for f, now in enumerate(t.time):
+    for f in np.flatnonzero(np.ones(len(t.time), bool) & t.kept).tolist():
         tools = FrameReadings(table.channel, t.noisy(t.tool[f, t.coils]), no_flags[: len(table)])
         seen = FrameReadings(REFERENCE.channel, t.noisy(t.reference[f]), no_flags)
-        frame = ChainFrame(FIRST_NS + round(1e9 * now), tools, seen if t.refit else None)
+        frame = ChainFrame(FIRST_NS + round(1e9 * t.time[f]), tools, seen if t.refit else None)
         for one in chain.step(frame):
             states[one.state] += 1
             if one.state == OK:
@@ -220,6 +221,14 @@ def faded(
     return t
 
 
+def skipping(size: float, **world: Any) -> Trial:
+    """Let the references drift, percent a minute, while stretches of up to a second are lost."""
+    t = faded(size, references=32, **world)
+    ends, frames = t.rng.integers(1, 25, len(t.time)).cumsum(), np.arange(len(t.time))
+    t.kept = np.searchsorted(ends, frames, 'right') % 2 == 0
+    return t
+
+
 def emitter_slid(size: float, **world: Any) -> Trial:
     """Let an emitter slide, mm in 30 s."""
     t, (setup, _) = trial(**{'seconds': 40.0, 'rate_hz': 12.5, **world}), real_board()
@@ -277,6 +286,8 @@ RECORDED = (
           (0.6, 2.0, 20.0)),
     Drift('gain-high', 'gain of the tool, high up, %', partial(gained, up_m=0.1), GAINS),
     Drift('gain-drift', 'the same, drifting', partial(gained, up_m=0.1, drifts=True), GAINS),
+    Drift('gain-coil', 'one coil, high up, %', partial(gained, up_m=0.1, coils=ONE), GAINS),
+    Drift('gain-coils', 'two coils, high up, %', partial(gained, up_m=0.1, coils=ALL[:2]), GAINS),
     Drift('gain-1', 'gain of the tool 1 %, gate', partial(gained, 1.0), (8.0, 20.0, 50.0)),
     Drift('gain-2', 'gain of the tool 2 %, gate', partial(gained, 2.0), (8.0, 20.0, 50.0)),
     Drift('gain-3', 'gain of the tool 3 %, gate', partial(gained, 3.0), GATES),
@@ -292,7 +303,8 @@ RECORDED = (
           partial(faded, references=32, coils=ONE), DRIFTS),
     Drift('references-parallel', 'the same, two coils',
           partial(faded, references=32, coils=PARALLEL), DRIFTS),
-    Drift('references-metal', 'the same, one coil, near moving metal',
+    Drift('references-skipped', 'the same, all coils, frames lost', skipping, DRIFTS),
+    Drift('references-metal', 'references drift, one coil, near moving metal',
           partial(faded, references=32, coils=ONE, metal=True), DRIFTS),
     Drift('fade-one', 'an emitter falls, no references, %/min', partial(faded, refit=False),
           DRIFTS),

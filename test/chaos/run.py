@@ -198,6 +198,9 @@ def main() -> int:
         '--again', type=Path, metavar='FILE',
         help='repeat what the run of a chaos.json could not judge, and keep the rest of its rows',
     )  # fmt: skip
+    parser.add_argument(
+        '--keep', action='store_true', help='keep the rows that --out has of other faults'
+    )
     parser.add_argument('--list', action='store_true', help='name all faults and end')
     args = parser.parse_args()
     trials, others = chosen(args)
@@ -210,8 +213,9 @@ def main() -> int:
     # Faults of one world share a chain.
     trials.sort(key=lambda faults: max(fault.world == 'metal' for fault in faults))
     found: dict[str, Row] = {}
+    if args.again or (args.keep and args.out.is_file()):
+        found = {row.name: row for row in load(args.again or args.out)}
     if args.again:
-        found = {row.name: row for row in load(args.again)}
         open_ = {row.name for row in found.values() if not row.is_judged}
         trials = [faults for faults in trials if _name(faults) in open_]
         others = []
@@ -229,7 +233,9 @@ def main() -> int:
                     print('  ' + minimised(chain, faults, args.seed, args.duration), flush=True)
         finally:
             chain.end()
-    rows = list(found.values())
+    order = ('files', *GROUPS, 'several', 'recorded')
+    rows = sorted(found.values(), key=lambda row: order.index(row.group))
+    save(args.out, rows)
     failed = [row for row in rows if row.failed(ALLOWED_S)]
     poses, wrong = sum(row.poses for row in rows), sum(row.wrong for row in rows)
     print(f'{len(rows)} faults, {len(failed)} failed; {wrong} of {poses} poses wrong and ok')

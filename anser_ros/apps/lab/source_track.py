@@ -267,7 +267,8 @@ def _judged(
         > SAME_PLACE_M
     )
     estimate = frame.estimate(
-        track.noise, solution, Freedom(freedom, UNKNOWNS, RARE), (place, axis, None),
+        track.noise, solution, Freedom(freedom, UNKNOWNS, RARE, freedom),
+        (place, axis, None),
         lambda _: _covariance(frame, solution), others,
         solution.position + solution.rotation @ frame.coils.offsets.mean(axis=0), 'place',
     )  # fmt: skip
