@@ -71,7 +71,7 @@ class Accuracy(_Stated):
 
 @dataclass(frozen=True)
 class ToolSettings(_Stated):
-    """States how well tools are known, and how fast they may be."""
+    """States how well tools are known, how fast they may be, and what emitters do meanwhile."""
 
     # Errors of a tool coil's place (each axis), axis (a tangent) and gain (relative). Too small,
     # and faultless coils contradict their body; too large, and a coil may be wrong by some times
@@ -84,6 +84,11 @@ class ToolSettings(_Stated):
     # and fast movements lose frames; too large, and wrong poses look like movements.
     max_speed_m_s: float = _value(2.0, 1e-3, 1e4)
     max_acceleration_m_s2: float = _value(40.0, 1e-3, 1e6)
+    # Deviation of an emitter's strength from the calibrated one, and of its rate of change, 1/s. Where no reference follows an emitter, tools learn its strength. The defaults are those
+    # of a coil that warms up by 10 K in a minute. Too small, and warm emitters cost poses; too
+    # large, and metal looks like warm emitters to a single coil.
+    emitter_offset: float = _value(0.03, 1e-9, 1.0)
+    emitter_rate_1_s: float = _value(5e-4, 1e-12, 1.0)
 
 
 @dataclass(frozen=True)
@@ -117,6 +122,8 @@ class RefitSettings(_Stated):
     tools: ToolSettings = field(default_factory=ToolSettings, compare=False)
 
 
+EMITTER_STEADY_S = 60.0
+"""Time for which an emitter that warms up goes on at its rate, s: that of a coil on a board."""
 SECTIONS = {
     'accuracy': {item.name: item for item in fields(Accuracy)},
     'refit': {item.name: item for item in fields(RefitSettings) if item.metadata},

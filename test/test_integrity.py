@@ -32,7 +32,7 @@ def wrong_and_ok(estimates, position, rotation):
     ]  # fmt: skip
 
 
-def track_with(fault, rng, count=80, settings=None, model=MODEL):
+def track_with(fault, rng, count=80, settings=None, model=MODEL, **options):
     """Track a moving tool whose fluxes (all so far, newest last) a fault changes.
 
     Returns all estimates by frame; none of them may be wrong and ok.
@@ -40,7 +40,7 @@ def track_with(fault, rng, count=80, settings=None, model=MODEL):
     tracker, seen, all_found = Tracker(model, TOOL, settings), [], []
     for i, (stamp, position, rotation) in enumerate(path(count)):
         seen.append(fluxes(MODEL, TOOL, position, rotation, rng))
-        found = tracker.update(stamp, CHANNELS, fault(i, seen))
+        found = tracker.update(stamp, CHANNELS, fault(i, seen), **options)
         assert wrong_and_ok(found, position, rotation) == [], i
         all_found.append({e.name: e for e in found})
     return all_found
@@ -151,17 +151,20 @@ def test_a_wide_gate_of_residuals_leaves_rigidity_and_continuity(rng, gate):
 
 
 @pytest.mark.parametrize('gain', [0.98, 1.01, 1.02])
-def test_a_gain_that_all_coils_have_in_common_is_in_every_sigma(rng, gain):
-    """High up it looks like a distance to each coil; the body tells it, whatever the gate."""
+@pytest.mark.parametrize('learns', [False, True])
+def test_a_gain_that_all_coils_have_in_common_is_in_every_sigma(rng, gain, learns):
+    """High up it looks like a distance to each coil; the body tells it, whatever the gate, and
+    without references it is learnt as one of the emitters.
+    """
     tracker, sigma = Tracker(MODEL, TOOL, TrackerSettings(gate=50.0)), {}
     for now in (1.0, gain):
         for stamp, position, rotation in path(120):
             place = position + [0.0, 0.0, 0.1]
             flux = now * fluxes(MODEL, TOOL, place, rotation, rng)
-            found = tracker.update(stamp + round(1e12 * now), CHANNELS, flux)
+            found = tracker.update(stamp + round(1e12 * now), CHANNELS, flux, learns=learns)
             assert wrong_and_ok(found, place, rotation) == []
             sigma[now] = found[-1].sigma_position_m
-    assert sigma[1.0] < 1e-4 and sigma[gain] > 5e-4
+    assert sigma[1.0] < 1e-4 and (learns or sigma[gain] > 5e-4)
 
 
 def test_a_survey_as_wrong_as_is_stated_contradicts_nothing(rng):
@@ -215,11 +218,11 @@ def test_a_leap_waits_for_three_frames_and_a_jerk_too():
 # The model ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('factor', [0.98, 1.01])
-def test_a_model_of_other_moments_gives_no_pose(rng, factor):
-    found = track_with(
-        lambda i, seen: seen[i], rng, 60, model=replace(MODEL, moments=factor * MODEL.moments)
-    )
+@pytest.mark.parametrize(('factor', 'learns'), [(0.98, False), (1.01, False), (0.8, True)])
+def test_a_model_of_other_moments_gives_no_pose(rng, factor, learns):
+    """No emitter that warms up is a fifth stronger."""
+    other = replace(MODEL, moments=factor * MODEL.moments)
+    found = track_with(lambda i, seen: seen[i], rng, 60, model=other, learns=learns)
     last = {e.state for frame in found[20:] for e in frame.values()}
     assert 'ok' not in last
     assert last <= {'residual', 'inconsistent', 'model_doubtful', 'unconfirmed'}

@@ -14,7 +14,12 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.rigid import BodyCoils, common_factor, solve_body, start_from_coils
 from anser_ros.tracking.solve import RealField, bounded_inverse
-from anser_ros.tracking.solve_context import NOT_FINITE, fill_model_errors, source_spacing
+from anser_ros.tracking.solve_context import (
+    NOT_FINITE,
+    fill_model_errors,
+    source_spacing,
+    strength_errors,
+)
 from anser_ros.tracking.tracker import Tracker
 
 SEED = 41
@@ -133,12 +138,14 @@ def columns_of(model):
     return RealField.of(model.positions, model.directions, model.moments).columns
 
 
-def written_errors(points, axes, lengths, dipoles, spacing, modes, sigma):
+def written_errors(points, axes, lengths, dipoles, spacing, modes, sigma, read=None):
     count, width = len(points), len(sigma)
     errors, near = np.empty((count, modes.shape[1] // width, width)), np.empty((count, 2))
     weights = np.empty((count, width, width))
     written = errors, weights, near
-    is_finite = fill_model_errors(points, axes, lengths, dipoles, spacing, modes, sigma, *written)
+    read = read or (np.zeros((count, width)), np.empty((0, 0)))
+    of = modes, sigma, *read
+    is_finite = fill_model_errors(points, axes, lengths, dipoles, spacing, *of, *written)
     assert is_finite, NOT_FINITE
     return errors, weights, near[:, 0], near[:, 1]
 
@@ -152,15 +159,21 @@ def both(modes, sigma, length):
         np.ascontiguousarray(modes).view(float).swapaxes(0, 1).reshape(len(model.positions), -1)
     )
     # Another coil beside it, so that the two are not mixed up.
+    seen = 1e-6 * np.arange(-16.0, 16.0).reshape(2, 16)
+    strengths = 1e-4 * np.random.default_rng(2).normal(size=(16, 3))
     errors, weights, away, among = written_errors(
         np.stack([POINT + 0.01, POINT]), np.stack([AXIS[::-1], AXIS]), np.array([0.0, length]),
-        columns_of(model), np.full(len(model.positions), 0.03), laid_out, sigma,
+        columns_of(model), np.full(len(model.positions), 0.03), laid_out, sigma, (seen, strengths),
     )  # fmt: skip
     distance = np.linalg.norm(model.positions - POINT, axis=1).min()
     assert away[1] == pytest.approx(distance)
     assert among[1] == pytest.approx(0.03 / distance)
     np.testing.assert_allclose(errors[1], flux[:, 0], rtol=1e-9, atol=1e-20)
     covariance = np.diag(sigma**2) + flux[:, 0].T @ flux[:, 0]
+    relative = strengths[0::2] + 1j * strengths[1::2]
+    by_strength = (seen.view(complex)[1][:, None] * relative).T.copy().view(float)
+    np.testing.assert_allclose(strength_errors(seen, strengths)[1], by_strength)
+    covariance += by_strength.T @ by_strength
     return np.linalg.inv(np.linalg.cholesky(covariance)), weights[1]
 
 

@@ -39,7 +39,8 @@ OTHER = {
     'stamp_sigma_s': 2e-3, 'emitter_drift': 0.05, 'min_references': 8, 'average_frames': 1,
     'persistence': 0.5, 'hold_frames': 3, 'references_age_s': 2.0, 'error_modes': 5, 'seed': 9,
     'tool_coil_position_m': 1e-3, 'tool_coil_axis_rad': 0.05, 'tool_coil_gain': 0.02,
-    'max_speed_m_s': 0.5, 'max_acceleration_m_s2': 5.0,
+    'max_speed_m_s': 0.5, 'max_acceleration_m_s2': 5.0, 'emitter_offset': 1e-9,
+    'emitter_rate_1_s': 1e-12,
 }  # fmt: skip
 """Another value of everything that may be stated."""
 OPTICAL = ('optical_position_m', 'optical_rotation_rad')

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import Array, ComplexArray
+from anser_ros.calibration.courses import NONE, StrengthCourses, let_change
 from anser_ros.calibration.layouts import Generator, Layout, grid, moments_of_field, place
 from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import (
@@ -211,6 +212,7 @@ class DrawnFit:
     model: FieldModel  # without corrections of sensors; its modes are what is open but the frame
     errors: Array  # (K, OWN): of the coils, and their standard deviations
     sigma: Array
+    changes: Array  # (K,), by how much coils became stronger while they were read, relative
     # (6,), m and rad: of a motion of all coils as one, about the middle of the drawing's places
     frame_sigma: Array
     plate: Array  # (7,): place (m), turn (rad) and scale of the typed places
@@ -248,19 +250,19 @@ class DrawnFitter:
         self.sensors = SensorParameters(measurements, kept, tones, is_free=False)
         self.parts = list(_parts(measurements, typed))
         self.middle = np.mean(np.concatenate([p.stated.position for p in self.parts]), axis=0)
-        self.count = len(generator.centres)
-        ends = np.cumsum([OWN * self.count, LEVEL.size, 7, len(self.sensors)]).tolist()
-        self.own, self.level, self.plate, self.sensed = (
-            slice(*pair) for pair in zip([0, *ends[:3]], ends, strict=True)
+        self.count, self.courses = len(generator.centres), StrengthCourses(measurements)
+        changing = self.count * self.courses.count
+        ends = np.cumsum([OWN * self.count, changing, LEVEL.size, 7, len(self.sensors)]).tolist()
+        self.own, self.changing, self.level, self.plate, self.sensed = (
+            slice(*pair) for pair in zip([0, *ends[:4]], ends, strict=True)
         )
-        self.values, self.width = np.zeros(ends[3]), np.zeros(ends[3])
+        self.values, self.width, self.scale = (np.zeros(ends[4]) for _ in range(3))
         self.width[self.level], self.width[self.plate] = LEVEL, PLATE
         table = np.arange(OWN * self.count).reshape(self.count, OWN)
         arms = generator.centres - generator.middle
-        self.scale = np.zeros(ends[3])
         self.scale[table[:, :3].ravel()] = arms.ravel() / (arms**2).sum()
         self.rest, start = table[:, KINDS['rest']].ravel(), self.sensed.start
-        self.width[self.rest] = REST
+        self.width[self.rest], self.width[self.changing] = REST, NONE
         self.groups = [(table[:, KINDS[kind]].ravel(), width) for kind, width in COIL.items()]
         self.groups += [(start + rows, SENSORS[kind]) for kind, rows in self.sensors.groups()]
         for rows, width in self.groups:
@@ -289,7 +291,7 @@ class DrawnFitter:
 
         What the drawing lacks is left to moments of their own that they get.
         """
-        self.width[self.rest] = 1e-12
+        self.width[self.rest] = NONE
         self._settle(PLACING_STEPS)
         shift, turn, scale = np.split(self.values[self.plate], [3, 6])
         back, own = _turned(turn), slice(len(self.drawing.owner))
@@ -316,6 +318,7 @@ class DrawnFitter:
     def _place(self, values: Array) -> None:
         """Bring board, sensors and poses to some values."""
         self.board = self.errors(values)
+        self.changes = values[self.changing].reshape(self.count, -1)
         self.dipoles = self.drawing.dipoles(self.board)
         shift, turn, scale = np.split(values[self.plate], [3, 6])
         rotation = _turned(turn)
@@ -327,7 +330,9 @@ class DrawnFitter:
                     there, position=self.middle + shift + arms, rotation=rotation @ there.rotation
                 )
             errors = self.sensors.errors_of(there.body, values[self.sensed])
-            part.now = moved(errors.apply(there), part.offset)
+            now = moved(errors.apply(there), part.offset)
+            strengths = self.courses.strengths(now, self.changes)
+            part.now = replace(now, flux=now.flux / strengths[:, None])
 
     def _terms(self, now: Measurements) -> tuple[PoseTerms, tuple[ComplexArray, ...]]:
         """Residuals of frames, with fluxes and their derivatives by coils' places and axes."""
@@ -344,19 +349,19 @@ class DrawnFitter:
         white = PoseWhitener(terms.slope, part.weights, self.noise_t, jitter**-2.0)
         by_shape = self._by_shape(now, made[0])
         shared = self._shared(part, terms, made, by_shape)
-        root = (np.sqrt(part.weights) / self.noise_t)[:, :, None]
-        frames, sensors = part.weights.shape
+        root, (frames, sensors) = np.sqrt(part.weights) / self.noise_t, part.weights.shape
         slope = white.slope.reshape(frames, sensors, -1, 6)
         normal, gradient = np.zeros((size, size)), np.zeros(size)
         mixed = np.zeros((frames, 6, size))
         for k, own in enumerate(self._of_coils(now, made, by_shape)):
             pair = slice(2 * k, 2 * k + 2)
-            rows = np.concatenate([own, shared[:, :, pair]], axis=3) * root[..., None]
+            rows = np.concatenate([own, shared[:, :, pair]], axis=3) * root[:, :, None, None]
             rows = rows.reshape(frames, 2 * sensors, -1)
-            at = np.concatenate([OWN * k + np.arange(OWN), np.arange(self.level.start, size)])
+            changes = self.changing.start + self.courses.count * (k + np.arange(2))
+            at = np.r_[OWN * k : OWN * (k + 1), slice(*changes), self.level.start : size]
             flat = rows.reshape(-1, at.size)
             normal[np.ix_(at, at)] += flat.T @ flat
-            gradient[at] += flat.T @ (terms.residual[:, :, pair] * root).ravel()
+            gradient[at] += flat.T @ (terms.residual[:, :, pair] * root[:, :, None]).ravel()
             along = slope[:, :, pair].reshape(frames, -1, 6)
             mixed[:, :, at] += along.transpose(0, 2, 1) @ rows
         answer = white.inverse @ mixed
@@ -398,9 +403,9 @@ class DrawnFitter:
     def _of_coils(
         self, now: Measurements, made: tuple[ComplexArray, ...], by_shape: ComplexArray
     ) -> Iterator[Array]:
-        """Yield the derivatives (F, S, 2, OWN) of each coil's fluxes by its own errors."""
+        """Yield the derivatives (F, S, 2, .) of each coil's fluxes by its errors and changes."""
         flux, by_place, by_axis = made
-        points, axes = now.placed()
+        (points, axes), ways = now.placed(), self.courses.of(now)
         rest = (basis_rows(now, self.drawing.layer) @ self.drawing.rest).reshape(
             *flux.shape[:2], -1
         )
@@ -410,8 +415,9 @@ class DrawnFitter:
             strength = 1.0 + errors[6] + 1j * errors[7]
             own = flux[..., k, None] / strength
             shape = by_shape[..., k, :]
+            late = flux[..., k, None] * ways[:, None]
             each = [-by_place[..., k], -turn, own, 1j * own, shape, strength * rest]
-            whole = np.concatenate(each, axis=-1)
+            whole = np.concatenate([*each, late, 1j * late], axis=-1)
             yield np.stack([whole.real, whole.imag], axis=2)
 
     def _likelihood(self, sums: Sequence[_Sums]) -> Likelihood:
@@ -430,6 +436,10 @@ class DrawnFitter:
                 ratio = np.diag(found.covariance)[rows] / self.width[rows] ** 2
                 self.width[rows] = _learnt(found.values[rows], ratio, stated)
             found = solve(likelihood, self.width)
+        if is_learning:
+            changes = np.arange(self.changing.start, self.changing.stop)
+            found = let_change(likelihood, found, list(changes.reshape(2 * self.count, -1)))
+            self.width = found.width
         change, self.values = found.values - self.values, found.values
         for part, one in zip(self.parts, sums, strict=True):
             part.offset = part.offset + one.step - one.answer @ change
@@ -486,12 +496,15 @@ class DrawnFitter:
         evidence = {}
         for kind in self.sensors.kinds:
             without = self.width.copy()
-            without[self.sensed.start + self.sensors.rows(kind)] = 1e-12
+            without[self.sensed.start + self.sensors.rows(kind)] = NONE
             evidence[kind] = found.evidence - solve(likelihood, without).evidence
+        each = [self.courses.strengths(part.now, self.changes) for part in self.parts]
+        last = np.argmax(np.concatenate([part.now.time for part in self.parts]))
         return DrawnFit(
-            model, self.board, found.sigma[self.own].reshape(self.count, OWN), frame_sigma,
-            found.values[self.plate], self.sensors, sensed, evidence, self.noise_t, self.jitter,
-            tuple(self.parts), tuple(held_out),
+            model, self.board, found.sigma[self.own].reshape(self.count, OWN),
+            np.concatenate(each)[last].real - 1.0, frame_sigma, found.values[self.plate],
+            self.sensors, sensed, evidence, self.noise_t, self.jitter, tuple(self.parts),
+            tuple(held_out),
             float((found.covariance * likelihood.information).sum()), steps,
         )  # fmt: skip
 

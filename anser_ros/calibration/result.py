@@ -54,6 +54,12 @@ def undetermined_words(result: SensorFit) -> tuple[str, ...]:
     )
 
 
+def at_start(model: FieldModel) -> FieldModel:
+    """Return a model that says for its file which strengths it has of emitters that change."""
+    state = {'emitter_strengths': 'those at the start of each session'}
+    return replace(model, provenance={**model.provenance, **state})
+
+
 def drift_records(strength: ComplexArray) -> tuple[EffectRecord, ...]:
     """Return the emitters that drifted in a scan, from their strengths (F, K), and how far."""
     size = np.abs(strength)

@@ -64,8 +64,9 @@ class TrackingHalf:
         if standing.model is not self.tracker.model:
             self._track_with(standing.model)
         return self.tracker.update(
-            stamp_ns, tools.channels, tools.flux, tools.flags, standing.withheld
-        )
+            stamp_ns, tools.channels, tools.flux, tools.flags, standing.withheld,
+            learns=not self.answer.follows,
+        )  # fmt: skip
 
     @staticmethod
     def _is_given(answer: Answer) -> bool:

@@ -278,10 +278,12 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     shown: list[Any] = [output.terminal_table(ERRORS_HEAD, error_rows(document))]
     if 'refit' in document:
         shown.append(_refit_line(document['refit']))
+    strengths = evaluation.strengths
     notes = (
         *sessions.snapshot_notes(args.model, model),
         *output.loss_notes(session, baseline),
         *((_few_notes(session) if args.refit else ()) or why),
+        *((f'emitters differ from the model, tools say: {strengths}',) if strengths else ()),
     )
     return output.Result(document, notes, tuple(shown), tuple(written))
 
@@ -314,8 +316,8 @@ def why_withheld(model: FieldModel, evaluation: Evaluation) -> tuple[str, ...]:
     listed = f'the coils of its calibration (channels {", ".join(map(str, known))})'
     why = (
         f': the model knows {listed if known else "no coil by itself"}; another one is off in '
-        'gain and axis, by 2 % and 1 deg as wound by hand, and so is an emitter that warmed up: '
-        'calibrate with what is tracked, when the board is warm, and look for metal'
+        'gain and axis, by 2 % and 1 deg as wound by hand: calibrate with what is tracked, and '
+        'look for metal'
     )
     return (
         f'most poses are withheld, state {worst} in {count} of {len(poses)}{such}'

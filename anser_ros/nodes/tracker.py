@@ -426,6 +426,7 @@ class TrackerNode(AnserNode):
             # A drift takes no recorded course here: field_model follows it by its references.
             'left_to_references': ', '.join(tracker.drifting_effects),
             'corrected': ', '.join(tracker.corrected_effects),
+            'emitter_strengths': tracker.emitter_strengths,
         }
         withheld = None if half is None else half.withheld
         if withheld is not None and withheld.state != TWO_SOURCES:

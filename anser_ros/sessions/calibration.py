@@ -22,7 +22,7 @@ from anser_ros.calibration.drawn_fit import FINE
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.readings import check_single_coils, with_pose
-from anser_ros.calibration.result import Calibration, Scan, drift_records
+from anser_ros.calibration.result import Calibration, Scan, at_start, drift_records
 from anser_ros.calibration.sensor_parameters import EXTRA_KINDS, KINDS
 from anser_ros.diagnosis.departure import KNOWN, Departure, departure
 from anser_ros.diagnosis.problem import Problem, Spread, build_problem
@@ -292,10 +292,7 @@ def _fit_as_scan(
         check_explained(calibration)
     scan = calibration.scan
     scan = replace(scan, reported_effects=(*scan.reported_effects, *drifts))
-    model = calibration.model
-    if drifts:
-        state = {'emitter_strengths': 'those at the start of each session'}
-        model = replace(model, provenance={**model.provenance, **state})
+    model = at_start(calibration.model) if drifts else calibration.model
     return replace(calibration, model=model, scan=scan)
 
 

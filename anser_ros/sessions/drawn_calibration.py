@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from anser_ros.arrays import Array, ComplexArray
 from anser_ros.calibration.calibrate import Options
+from anser_ros.calibration.disturbances import LEAST_DRIFT
 from anser_ros.calibration.drawn_fit import (
     LEVEL,
     PLACE,
@@ -41,6 +42,7 @@ from anser_ros.calibration.result import (
     OUTLIER_WEIGHT,
     Calibration,
     Scan,
+    at_start,
     corrections,
     residuals,
     with_provenance,
@@ -144,7 +146,8 @@ def fit_to_drawing(
             f'{noise_t:.2g} T are noise. Is metal near, or are coils exchanged?'
         )
     names = [Path(session.path).name for session in sessions for _ in session.tools]
-    return with_provenance(_calibration(fit, found, typed, generator, options), names)
+    made = with_provenance(_calibration(fit, found, typed, generator, options), names)
+    return replace(made, model=at_start(made.model))
 
 
 def _few_words(generator: Generator) -> str:
@@ -458,7 +461,8 @@ WAYS = (('left', 'right'), ('front', 'back'), ('down', 'up'))
 def emitter_rows(fit: DrawnFit, generator: Generator) -> tuple[dict[str, object], ...]:
     """Return of each emitter how it differs from its drawing, with one sigma, and in words."""
     rows = []
-    for name, error, sigma in zip(generator.emitters, fit.errors, fit.sigma, strict=True):
+    each = zip(generator.emitters, fit.errors, fit.sigma, fit.changes.tolist(), strict=True)
+    for name, error, sigma, change in each:
         words = [
             f'sits {1e3 * abs(error[j]):.1f} ± {1e3 * sigma[j]:.1f} mm further '
             f'{WAYS[j][int(error[j] > 0.0)]} than drawn'
@@ -473,6 +477,9 @@ def emitter_rows(fit: DrawnFit, generator: Generator) -> tuple[dict[str, object]
                 f'is {100 * abs(error[6]):.1f} ± {100 * sigma[6]:.1f} % '
                 f'{"stronger" if error[6] > 0 else "weaker"}'
             )
+        if abs(change) > LEAST_DRIFT:
+            way = 'stronger' if change > 0.0 else 'weaker'
+            words.append(f'became {100 * abs(change):.1f} % {way} while it was read')
         rows.append(
             {
                 'shift_m': error[:3].tolist(), 'tilt_rad': error[3:5].tolist(),

@@ -80,7 +80,8 @@ def track(
     estimates: dict[str, list[PoseEstimate]] = {}
     further: dict[str, dict[str, list[PoseEstimate]]] = {one.KIND: {} for one in observers}
     age_s = prepared.session.setup.refit.references_age_s
-    chain = Chain(follower, TrackingHalf(tracker, age_s))
+    half = TrackingHalf(tracker, age_s)
+    chain = Chain(follower, half)
     frames = list(frames_of(prepared.session))
     for count, frame in enumerate(frames, start=1):
         for estimate in chain.step(frame.in_phase() if in_phase else frame):
@@ -96,7 +97,7 @@ def track(
     others = {kind: one.compare(prepared, further[kind]) for kind, one in found_by.items()}
     others = {kind: series for kind, series in others.items() if series}
     summary = None if follower is None else follower.summary
-    return Evaluation(sensors, bodies, summary, others)
+    return Evaluation(sensors, bodies, summary, others, half.tracker.emitter_strengths)
 
 
 @dataclass(frozen=True)
@@ -174,6 +175,9 @@ class Evaluation:
     bodies: dict[str, PoseSeries]
     refit: RefitSummary | None = None
     further: dict[str, dict[str, PoseSeries]] = field(default_factory=dict)
+    strengths: str = (
+        ''  # How emitters differed from the model at the end, in words, where they did
+    )
 
     @property
     def groups(self) -> dict[str, dict[str, PoseSeries]]:

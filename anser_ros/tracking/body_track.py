@@ -16,6 +16,7 @@ from anser_ros.tracking.coil_track import CoilResult
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve import bounded_inverse
+from anser_ros.tracking.solve_context import strength_errors
 from anser_ros.tracking.solve_verdict import RARE, Freedom, SolveFrame
 
 DISAGREES = 4.0
@@ -143,17 +144,23 @@ class BodyFrame(SolveFrame):
         """Return the inverse of each sigma, 1/T, shape (2K,)."""
         return 1.0 / self.context.sigma
 
-    def common(self, used: Integers, start: Start) -> Array:
-        """Errors that some coils share, see `common_factor`."""
-        weights = np.tile(self.inverse_sigma, (len(used), 1))
-        gains = self.coils.subset(used).gain_errors(self.flux[used])
-        if self.context.modes is None:
-            return rigid.common_factor(gains, weights)
+    def shared(self, used: Integers, start: Start) -> Array:
+        """Return errors (S, R, 2K) that some coils share, T, one standard deviation each."""
         coils, (position, rotation) = self.coils.subset(used), start
+        gains = coils.gain_errors(self.flux[used])
+        if self.context.modes is None:
+            return gains
         points, axes = coils.offsets @ rotation.T + position, coils.axes @ rotation.T
-        shared = self.context.errors_at(points, axes, coils.lengths)
-        modes = np.concatenate([shared, gains], axis=1) if gains.shape[1] else shared
-        return rigid.common_factor(modes, weights)
+        modes = self.context.errors_at(points, axes, coils.lengths)
+        return np.concatenate([modes, gains], axis=1) if gains.shape[1] else modes
+
+    def common(self, used: Integers, start: Start) -> Array:
+        """Return what these and the emitters' strengths do, see `common_factor`."""
+        shared, strengths = self.shared(used, start), self.context.strengths
+        if strengths.size:
+            own = strength_errors(self.flux[used], strengths)
+            shared = np.concatenate([shared, own], axis=1)
+        return rigid.common_factor(shared, np.tile(self.inverse_sigma, (len(used), 1)))
 
     def nearer(self, start: Start, used: Integers) -> Start:
         """Return a start moved to where the coils' own good poses agree best."""
@@ -170,7 +177,8 @@ class BodyFrame(SolveFrame):
         return nearer
 
 
-def _solve(frame: BodyFrame, used: Integers, start: Start) -> BodyFit:
+def solve_with(frame: BodyFrame, used: Integers, start: Start) -> BodyFit:
+    """Return the fit of some of a body's coils from a start near it."""
     part, context = frame.coils.subset(used), frame.context
     weights = np.tile(frame.inverse_sigma, (len(used), 1))
     solution = rigid.solve_body(
@@ -193,7 +201,7 @@ def _without_disagreeing(fit: BodyFit, frame: BodyFrame, gate: float) -> BodyFit
             break
         if misfit[worst] < DISAGREES * others.mean():
             break
-        fit = _solve(frame, rest, (fit.solution.position, fit.solution.rotation))
+        fit = solve_with(frame, rest, (fit.solution.position, fit.solution.rotation))
     return fit
 
 
@@ -228,7 +236,7 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
     fits = _from_good(track, frame, used)
     continues = bool(fits)
     if not fits:
-        fits = [_solve(frame, used, start) for start in _cold_starts(frame, used)]
+        fits = [solve_with(frame, used, start) for start in _cold_starts(frame, used)]
         fits.sort(key=lambda candidate: candidate.ratio)
         fits[:1] = [_without_disagreeing(f, frame, gate) for f in fits[:1]]
     if not fits:
@@ -264,7 +272,7 @@ def _on_other_sides(frame: BodyFrame, fit: BodyFit) -> list[BodyFit]:
         across, away = middle + signs * place, (signs - 1.0) * place
         if frame.settings.box.contains(across) and np.linalg.norm(away) > SAME_PLACE_M:
             rotation = -signs[:, None] * solution.rotation
-            found.append(_solve(frame, fit.used, (across - rotation @ lever, rotation)))
+            found.append(solve_with(frame, fit.used, (across - rotation @ lever, rotation)))
     return found
 
 
@@ -278,11 +286,11 @@ def _from_good(track: BodyTrack, frame: BodyFrame, used: Integers) -> list[BodyF
     if track.left_out and stamp_ns < track.again_ns:
         kept = np.array([i for i in used if int(i) not in track.left_out], dtype=np.int64)
         if len(kept) > 1 and frame.coils.subset(kept).observable:
-            fit = _solve(frame, kept, start)
+            fit = solve_with(frame, kept, start)
             if fit.good(gate):
                 return [fit]
     track.again_ns = stamp_ns + round(LEFT_OUT_S / NANO)
-    fit = _without_disagreeing(_solve(frame, used, start), frame, gate)
+    fit = _without_disagreeing(solve_with(frame, used, start), frame, gate)
     return [fit] if fit.good(gate) else []
 
 

@@ -118,12 +118,14 @@ def _knows_errors(s, position, axis, memory, model):  # type: ignore[no-untyped-
     """Return whether the error that is remembered for coil ``s`` is that at a pose, too."""
     at = memory.error_at[s]
     is_near = _distance(position, at[:3]) < memory.reach_m[s]
-    return model.modes.shape[0] == 0 or (is_near and _distance(axis, at[3:]) < ERROR_REACH)
+    is_certain = model.modes.shape[0] == 0 and model.strengths.shape[0] == 0
+    return is_certain or (is_near and _distance(axis, at[3:]) < ERROR_REACH)
 
 
 @inlined
-def _take_errors_of(coils, positions, axes, lengths, memory, model):  # type: ignore[no-untyped-def]
-    """Remember the model's error for coils (C,) at poses, ``positions`` and ``axes`` (C, 3).
+def _take_errors_of(coils, positions, axes, lengths, flux, memory, model):  # type: ignore[no-untyped-def]
+    """Remember the model's error for coils (C,) at poses, ``positions`` and ``axes`` (C, 3), where
+    they read ``flux`` (C, 2K), T.
 
     All are worked out together, for reading the model's modes takes longest.
     """
@@ -132,28 +134,29 @@ def _take_errors_of(coils, positions, axes, lengths, memory, model):  # type: ig
     near = np.empty((count, 2))
     is_finite = fill_model_errors(
         positions, axes, lengths, model.uncertain, model.spacing, model.modes, model.sigma,
-        errors, whitening, near,
+        flux, model.strengths, errors, whitening, near,
     )  # fmt: skip
     for c in range(count):
         s = coils[c]
         memory.errors[s], memory.whitening[s] = errors[c], whitening[c]
         memory.error_at[s, :3], memory.error_at[s, 3:] = positions[c], axes[c]
-        memory.reach_m[s] = ERROR_REACH * near[c, 0] if is_finite else -1.0
+        far = min(near[c, 0], math.sqrt((positions[c] ** 2).sum()))
+        memory.reach_m[s] = ERROR_REACH * far if is_finite else -1.0
         memory.among[s] = near[c, 1]
     return is_finite
 
 
 @kernel
-def take_errors(s, position, axis, length, memory, model):  # type: ignore[no-untyped-def]
+def take_errors(s, position, axis, length, flux, memory, model):  # type: ignore[no-untyped-def]
     """Remember the model's error for coil ``s`` at a pose, unless what is remembered is near.
 
-    ``length`` (1,), m; ``model`` is `SolveContext.arrays`. Returns False where the covariance is
-    not finite.
+    ``length`` (1,), m; ``flux`` (1, 2K), T, is what it reads; ``model`` is `SolveContext.arrays`.
+    Returns False where the covariance is not finite.
     """
     if _knows_errors(s, position, axis, memory, model):
         return True
     coil, here, along = np.array([s]), position.reshape(1, 3), axis.reshape(1, 3)
-    return _take_errors_of(coil, here, along, length, memory, model)
+    return _take_errors_of(coil, here, along, length, flux, memory, model)
 
 
 @kernel
@@ -255,7 +258,7 @@ def follow_coils(stamp_ns, values, sound, lengths, memory, model, rules, out):  
             count += 1
     coils = unknown[:count]
     if count > 0 and not _take_errors_of(
-        coils, out.position[coils], out.axis[coils], lengths[coils], memory, model
+        coils, out.position[coils], out.axis[coils], lengths[coils], values[coils], memory, model
     ):
         return False
     for s in range(values.shape[0]):
@@ -273,7 +276,7 @@ def follow_coils(stamp_ns, values, sound, lengths, memory, model, rules, out):  
             continue
         out.fault[s] = _judge_coil(s, memory, model, rules, out)
         if out.fault[s] == SOUND:
-            if not take_errors(s, position, axis, lengths[row], memory, model):
+            if not take_errors(s, position, axis, lengths[row], values[row], memory, model):
                 return False
             remember(s, stamp_ns, position, axis, out.residual[s], ratio, rules.freedom, memory)
     return True

@@ -56,7 +56,7 @@ class CoilTracks:
 
     def __init__(self, count: int) -> None:
         self.scans = [Scans() for _ in range(count)]
-        self._made_for: tuple[ErrorModes | None, Array] | None = None
+        self._made_for: tuple[ErrorModes | None, Array, Array] | None = None
         self._ruled: tuple[TrackerSettings, Freedom, coil_step.Rules] | None = None
         noise = np.tile(FRESH_NOISE, (count, 1))
         self.noise = [NoiseScale(row) for row in noise]
@@ -77,22 +77,23 @@ class CoilTracks:
         """Drop what is remembered of the errors of another model; return the memory."""
         modes, sigma = context.modes, context.sigma
         if self._made_for is not None:
-            known, own = self._made_for
-            if known is modes and (own is sigma or np.array_equal(own, sigma)):
+            known, own, strengths = self._made_for
+            is_same = own is sigma or np.array_equal(own, sigma)
+            if known is modes and strengths is context.strengths and is_same:
                 return self.memory
         memory, count, width = self.memory, len(self.scans), sigma.size
         rank = 0 if modes is None else modes.moments.shape[1] // width
-        rows = 1 if modes is None else width
+        rows = 1 if context.is_certain else width
         if memory.whitening.shape[1:] != (rows, width) or memory.errors.shape[1] != rank:
             memory = memory._replace(
                 errors=np.empty((count, rank, width)), whitening=np.empty((count, rows, width))
             )
         if memory.whitened.shape[1] != width:
             memory = memory._replace(whitened=np.full((count, width), np.nan))
-        if modes is None:
+        if context.is_certain:
             memory.whitening[:] = whitening_of(sigma)
         memory.reach_m[:], memory.among[:] = -1.0, 0.0
-        self.memory, self._made_for = memory, (modes, sigma)
+        self.memory, self._made_for = memory, (modes, sigma, context.strengths)
         return memory
 
     def follow(
@@ -199,7 +200,7 @@ def _cold(frame: CoilFrame, scans: Scans) -> list[CoilSolution]:
         context.field, context.grid, frame.flux, whitening_of(context.sigma), context.low,
         context.high, frame.length, limit, thorough=scans.failures % THOROUGH_EVERY == 0,
     )  # fmt: skip
-    if context.modes is None:
+    if context.is_certain:
         return found
     near = [s for s in found if s.chi2 <= 100.0 * limit or s is found[0]]
     return sorted(
@@ -218,8 +219,9 @@ def _descend(frame: CoilFrame, position: Array, axis: Array) -> CoilSolution:
 
 def _take_errors(frame: CoilFrame, position: Array, axis: Array) -> None:
     """Remember the model's error for the coil at a pose."""
-    length, memory = np.array([frame.length]), frame.tracks.memory
-    if not coil_step.take_errors(frame.row, position, axis, length, memory, frame.context.arrays):
+    length, memory, flux = np.array([frame.length]), frame.tracks.memory, frame.flux[None]
+    model = frame.context.arrays
+    if not coil_step.take_errors(frame.row, position, axis, length, flux, memory, model):
         raise TrackingError(NOT_FINITE)
 
 

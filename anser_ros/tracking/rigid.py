@@ -221,6 +221,11 @@ class BodyCoils:
     lengths: Array
     changes: Array | None = None
 
+    @staticmethod
+    def single(length_m: float) -> 'BodyCoils':
+        """Return a coil by itself, along z."""
+        return BodyCoils(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.array([length_m]))
+
     @cached_property
     def observable(self) -> bool:
         """Return whether two coils are not parallel, so that all six degrees of freedom show."""

@@ -7,6 +7,7 @@ weight, and the covariance grows accordingly.
 
 import hashlib
 import math
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
@@ -33,26 +34,29 @@ NOT_FINITE = 'the model covariance must be finite'
 
 @kernel
 def fill_model_errors(  # type: ignore[no-untyped-def]
-    points, axes, lengths, dipoles, spacing, modes, sigma, errors, whitening, near
+    points, axes, lengths, dipoles, spacing, modes, sigma, flux, strengths, errors, whitening, near
 ):  # fmt: skip
     """Write the model's error at S coils, and the factors that make their residuals white.
 
     The coils have centres ``points`` (m), unit ``axes`` (S, 3), frame fg, and ``lengths``, m. The
     N ``dipoles``, rows of `RealField.columns`, have uncertain moments: ``modes`` (N, R 2K) are
     errors of one standard deviation each, A m^2, ``spacing`` is `source_spacing`, m. ``sigma``
-    (2K,) is each flux component's standard deviation, T.
+    (2K,) is each flux component's standard deviation, T. The coils read about ``flux`` (S, 2K), T,
+    and ``strengths`` (2K, Q), real and imaginary part by turns, are relative errors of the
+    emitters', of one standard deviation each.
 
     Written are flux errors E (S, R, 2K) of one standard deviation each, T; the ``whitening``
-    (S, 2K, 2K), 1/T, the inverse Cholesky factor of ``diag(sigma)^2 + E^T E``; and ``near``
+    (S, 2K, 2K), 1/T, the inverse Cholesky factor of ``diag(sigma)^2 + E^T E``, and of what the
+    emitters' strengths do besides; and ``near``
     (S, 2): the distance from the nearest of the dipoles, m, and spacing over distance of the
     dipole for which that is largest: above 1 a coil is where the dipoles are no description of the
     field. Returns False where a covariance is not finite.
     """
     width, count = sigma.shape[0], errors.shape[1]
-    factor, scaled = np.empty((width, width)), np.empty((width, count))
+    factor, scaled = np.empty((width, width)), np.empty((width, count + strengths.shape[1]))
     basis = np.empty((points.shape[0], dipoles.shape[1]))
     fill_flux_basis(points, axes, lengths, dipoles, basis)
-    flux = np.dot(basis, modes)
+    made = np.dot(basis, modes)
     for s in range(points.shape[0]):
         out, square, among = whitening[s], math.inf, 0.0
         for j in range(dipoles.shape[1]):
@@ -63,8 +67,13 @@ def fill_model_errors(  # type: ignore[no-untyped-def]
         near[s, 0], near[s, 1] = math.sqrt(square), math.sqrt(among)
         for i in range(width):
             for r in range(count):
-                errors[s, r, i] = flux[s, r * width + i]
+                errors[s, r, i] = made[s, r * width + i]
                 scaled[i, r] = errors[s, r, i] / sigma[i]
+        for i in range(0, width, 2):
+            for r in range(strengths.shape[1]):
+                a, b = strengths[i, r], strengths[i + 1, r]
+                scaled[i, count + r] = (flux[s, i] * a - flux[s, i + 1] * b) / sigma[i]
+                scaled[i + 1, count + r] = (flux[s, i + 1] * a + flux[s, i] * b) / sigma[i + 1]
         gram = np.dot(scaled, scaled.T)
         for i in range(width):
             gram[i, i] += 1.0
@@ -91,6 +100,13 @@ def fill_model_errors(  # type: ignore[no-untyped-def]
             for j in range(i + 1):
                 out[i, j] /= sigma[j]
     return True
+
+
+def strength_errors(flux: Array, strengths: Array) -> Array:
+    """Return what errors of emitters' strengths (2K, Q) make of fluxes (S, 2K): (S, Q, 2K), T."""
+    relative = np.ascontiguousarray(strengths.T).view(np.complex128)
+    values = np.ascontiguousarray(flux).view(np.complex128)
+    return (values[:, None, :] * relative).view(np.float64)
 
 
 def source_spacing(positions: Array, floor_m: float) -> Array:
@@ -232,11 +248,14 @@ class ModelArrays(NamedTuple):
     uncertain: Array  # (6, M), the dipoles whose moments are uncertain, as in `columns`
     spacing: Array
     modes: Array  # (M, R 2K); (0, 0) without uncertainty
+    strengths: Array
     low: Array
     high: Array
     share: float
 
 
+AS_THEY_ARE: Array = np.empty((0, 0))
+"""Errors of emitters' strengths where these are the model's."""
 LEAST_READING = 0.01
 """Least share of a field that tells places apart, of the strongest component: errors of gains and
 of the model are some thousandths, and a pose that followed from less would be theirs."""
@@ -256,7 +275,22 @@ class SolveContext:
     model_id: str
     # Part of the expected residual's power that is the model's own error, the modes aside
     model_share: float
-    shift_sigma_m: float = 0.0  # The model's
+    shift_sigma_m: float  # The model's
+    # (2K, Q), relative errors of the emitters' strengths, of one standard deviation each, real and
+    # imaginary part by turns; (0, 0) where these are the model's
+    strengths: Array
+
+    @property
+    def is_certain(self) -> bool:
+        """Return whether flux components err by ``sigma`` alone, each by itself."""
+        return self.modes is None and not self.strengths.size
+
+    def with_strengths(self, strengths: Array) -> 'SolveContext':
+        """Return the same with other errors of the emitters' strengths."""
+        other = copy(self)  # with what has been worked out of the field
+        other.__dict__.pop('arrays', None)
+        object.__setattr__(other, 'strengths', strengths)
+        return other
 
     @property
     def grid(self) -> SeedGrid:
@@ -305,8 +339,8 @@ class SolveContext:
             uncertain, spacing = columns.take(modes.rows, axis=1), modes.spacing
             moments = modes.moments
         return ModelArrays(
-            columns, self.field.moments, self.sigma, uncertain, spacing, moments, self.low,
-            self.high, self.model_share,
+            columns, self.field.moments, self.sigma, uncertain, spacing, moments, self.strengths,
+            self.low, self.high, self.model_share,
         )  # fmt: skip
 
     def make_ready(self) -> None:
@@ -367,8 +401,9 @@ def build_context(
         starts = previous.starts.following()
     share = 1.0 - settings.flux_noise_t**2 / variance
     return SolveContext(
-        field, sigma, modes, starts, low, high, name, share, float(model.shift_sigma_m)
-    )
+        field, sigma, modes, starts, low, high, name, share, float(model.shift_sigma_m),
+        AS_THEY_ARE,
+    )  # fmt: skip
 
 
 FEWEST_EMITTERS = 6
@@ -406,5 +441,8 @@ def without_dead(
         modes = previous.context.modes
     elif modes is not None:
         modes = modes.of_components(kept)
-    reduced = replace(context, field=field, sigma=sigma, modes=modes, starts=starts)
+    strengths = context.strengths[kept] if context.strengths.size else context.strengths
+    reduced = replace(
+        context, field=field, sigma=sigma, modes=modes, starts=starts, strengths=strengths
+    )
     return ReducedScene(context, living, reduced)

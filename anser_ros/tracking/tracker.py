@@ -9,7 +9,7 @@ guess.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -24,12 +24,13 @@ from anser_ros.errors import TrackingError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import FAULTS, GOOD, STUCK_CODE, Frame, Freshness, Intake, value_codes
 from anser_ros.integrity.pose_checks import distances
+from anser_ros.physics.rotations import quaternion_of_axis, rotation_of_quaternion
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import Withheld
 from anser_ros.stamps import NANO
 from anser_ros.tracking import rigid
-from anser_ros.tracking.body_track import BodyFrame, BodyResult, BodyTrack, track_body
+from anser_ros.tracking.body_track import BodyFrame, BodyResult, BodyTrack, solve_with, track_body
 from anser_ros.tracking.coil_track import CoilFrame, CoilResult, CoilTracks, track_coil
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.judgement import Judgement, RigidBody
@@ -41,6 +42,7 @@ from anser_ros.tracking.solve_context import (
     depends_on,
     without_dead,
 )
+from anser_ros.tracking.strengths import EmitterStrengths, Look
 
 
 def _add(counters: Counter[str], name: str, by: int) -> None:
@@ -71,10 +73,12 @@ class Past:
         self.intake = Intake(sensors.channel, count, spares_dead=True, error=TrackingError)
         self.freshness = Freshness()
         self.judgement = Judgement()
+        self.strengths = EmitterStrengths()
         self.first_ns = 0
 
     def forget(self) -> None:
         self.judgement.forget()
+        self.strengths.forget(None, self.strengths.tools)
         self.coils.forget()
         for body in self.bodies.values():
             body.forget()
@@ -176,6 +180,12 @@ class Tracker:
         return self._past.intake.dead
 
     @property
+    def emitter_strengths(self) -> str:
+        """Return which emitters' strengths the tools have shown to differ from the model's."""
+        model = self.model
+        return '' if model is None else self._past.strengths.words(model.emitters)
+
+    @property
     def drifting_effects(self) -> tuple[str, ...]:
         """Return the model's effects left to the references: no recorded course applies."""
         correction = self._scene.correction
@@ -233,12 +243,14 @@ class Tracker:
         flux: AnyArray,
         flags: AnyArray | None = None,
         withheld: Withheld | None = None,
+        learns: bool = True,
     ) -> list[PoseEstimate]:
         """Estimate the poses of one frame: one a sensor, then one a rigid body.
 
         ``stamp_ns`` is the middle of the demodulation window; ``channels`` (S,) are those of the
         rows of ``flux`` (S, K), T, in any order, of which unknown ones are passed over; ``flags``
-        (S,) are bits of `wire.points`; ``withheld`` is why no pose may be given for this frame.
+        (S,) are bits of `wire.points`; ``withheld`` is why no pose may be given for this frame;
+        ``learns`` is whether tools show the emitters' strengths, which no reference follows.
         There are none for a frame that was already seen. Raises `TrackingError` when the stamp is
         not positive, shapes don't fit, a channel appears twice, or the emitters are not as many as
         the model's.
@@ -247,9 +259,9 @@ class Tracker:
         frame = self._past.intake.admit(
             stamp_ns, channels, flux, flags, names, self.settings.warm_age_s
         )
-        return [] if frame is None else self._track(frame, withheld)
+        return [] if frame is None else self._track(frame, withheld, learns)
 
-    def _track(self, frame: Frame, withheld: Withheld | None) -> list[PoseEstimate]:
+    def _track(self, frame: Frame, withheld: Withheld | None, learns: bool) -> list[PoseEstimate]:
         past, context = self._past, self._scene.context
         if frame.goes_back:
             self.reset()
@@ -265,10 +277,17 @@ class Tracker:
         if state:
             return self._without_poses(frame, state, context.model_id, reason)
         flux, codes = self._corrected(frame)
+        strengths = past.strengths
+        if not learns or strengths.field is not context.field:
+            strengths.forget(context.field, self.settings.tools)
+        if strengths.used is not None:
+            flux = flux / (1.0 + strengths.used)
+            context = context.with_strengths(strengths.errors)
         if frame.living is not None:
             self._scene.reduced = without_dead(context, frame.living, self._scene.reduced)
             flux, context = flux[:, frame.living], self._scene.reduced.context
-        return self._solved(frame.stamp_ns, np.ascontiguousarray(flux), codes, context)
+        learns = learns and frame.living is None and strengths.is_due(frame.stamp_ns)
+        return self._solved(frame.stamp_ns, np.ascontiguousarray(flux), codes, context, learns)
 
     def _few_emitters(self, living: Booleans) -> str:
         emitters = () if self.model is None else self.model.emitters
@@ -292,8 +311,9 @@ class Tracker:
         return flux, codes
 
     def _solved(
-        self, stamp_ns: int, flux: ComplexArray, codes: Integers, context: SolveContext
-    ) -> list[PoseEstimate]:
+        self, stamp_ns: int, flux: ComplexArray, codes: Integers, context: SolveContext,
+        learns: bool,
+    ) -> list[PoseEstimate]:  # fmt: skip
         """Return the poses of fluxes (S, K) whose readings are good or bad by ``codes`` (S,)."""
         values = flux.view(np.float64)
         coils = self._solved_coils(stamp_ns, values, codes, context)
@@ -311,12 +331,33 @@ class Tracker:
             bodies.append(RigidBody(rows, table, result))
         for observer in self._past.observers:
             observer.observe(frames)
+        if learns:
+            looks = self._looks(frames, bodies, coils, values, context)
+            self._past.strengths.learn(stamp_ns, looks)
         judged = self._past.judgement.judged(stamp_ns, coils, bodies, self.settings)
         if context.shift_sigma_m > 0.0:
             # No judge reckons with it: what all poses share contradicts none of them.
             for estimate in judged:
                 estimate.add_shift(context.shift_sigma_m)
         return judged
+
+    def _looks(
+        self, frames: Sequence[BodyFrame], bodies: Sequence[RigidBody],
+        coils: Sequence[CoilResult], values: Array, context: SolveContext,
+    ) -> Iterator[Look]:  # fmt: skip
+        """What emitters' strengths can be learnt from: bodies, and the coils that are of none."""
+        for frame, body in zip(frames, bodies, strict=True):
+            if body.result.fit is not None:
+                yield frame, body.result.fit
+        grouped = {row for body in bodies for row in body.rows.tolist()}
+        stamp_ns = coils[0].estimate.stamp_ns
+        for row, (estimate, found, _, among_metal, _) in enumerate(coils):
+            if found is not None and row not in grouped and not among_metal:
+                one = rigid.BodyCoils.single(float(self._scene.table.length[row]))
+                own = values[row : row + 1]
+                frame = BodyFrame(estimate.name, stamp_ns, own, context, self.settings, one, [])
+                turn = rotation_of_quaternion(np.array(quaternion_of_axis(found.axis)))
+                yield frame, solve_with(frame, np.zeros(1, np.int64), (found.position, turn))
 
     def _solved_coils(
         self, stamp_ns: int, values: Array, codes: Integers, context: SolveContext
@@ -383,7 +424,7 @@ def warm_up() -> None:
         places = sensors.position + [0.01, 0.02, 0.15]
         flux = model.flux(places, sensors.axis, sensors.length)
         tracker = Tracker(model, sensors, settings)
-        for stamp_ns in (1, 2, 3):
+        for stamp_ns in (1, 300_000_001, 600_000_001):  # frames that strengths are learnt from
             # New noise each time, for a reading that repeats is no reading.
             noise = settings.flux_noise_t * rng.standard_normal((2, *flux.shape))
             tracker.update(stamp_ns, sensors.channel, flux + noise[0] + 1j * noise[1])
