@@ -84,9 +84,10 @@ class ToolSettings(_Stated):
     # and fast movements lose frames; too large, and wrong poses look like movements.
     max_speed_m_s: float = _value(2.0, 1e-3, 1e4)
     max_acceleration_m_s2: float = _value(40.0, 1e-3, 1e6)
-    # Deviation of an emitter's strength from the calibrated one, and of its rate of change, 1/s. Where no reference follows an emitter, tools learn its strength. The defaults are those
-    # of a coil that warms up by 10 K in a minute. Too small, and warm emitters cost poses; too
-    # large, and metal looks like warm emitters to a single coil.
+    # Deviation of an emitter's strength from the calibrated one, and of its rate of change, 1/s.
+    # Where no reference follows an emitter, tools learn its strength. The defaults are those of a
+    # coil that warms up by 10 K in a minute. Too small, and warm emitters cost poses; too large,
+    # and metal looks like warm emitters to a single coil.
     emitter_offset: float = _value(0.03, 1e-9, 1.0)
     emitter_rate_1_s: float = _value(5e-4, 1e-12, 1.0)
 
