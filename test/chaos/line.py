@@ -31,8 +31,7 @@ SLICE_S = 0.1
 """Slices of time, s, of which the least delay of the unit is kept."""
 SLICES = 20
 """Slices before a pose's arrival in which the unit must not have been late: two seconds, in which
-the host's clock finds the earliest arrivals again. A unit that is late answers commands before it
-works out samples that were due earlier, which no device does, and so misleads that clock."""
+the host's clock finds the earliest arrivals again."""
 REOPEN_S = 0.05
 """Time between attempts to open the control unit's port, s."""
 
@@ -183,9 +182,9 @@ class Line:
     def late(self, at_s: float, more_than_s: float) -> bool:
         """Return whether the simulated unit itself was late at a monotonic time.
 
-        On a busy machine it works its samples out late, as no device does; what the host then
-        makes of their stamps is nobody's fault. Late is what came later, by the unit's clock, than
-        the earliest that ever came.
+        On a busy machine it works its samples out late, as no device does; that few have a good
+        stamp then is nobody's fault. Late is what came later, by the unit's clock, than the
+        earliest that ever came.
         """
         best = min(self._lateness.values(), default=0.0)
         slice_ = int(at_s / SLICE_S)
