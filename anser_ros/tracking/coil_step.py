@@ -140,7 +140,7 @@ def _take_errors_of(coils, positions, axes, lengths, flux, memory, model):  # ty
         s = coils[c]
         memory.errors[s], memory.whitening[s] = errors[c], whitening[c]
         memory.error_at[s, :3], memory.error_at[s, 3:] = positions[c], axes[c]
-        far = min(near[c, 0], math.sqrt((positions[c] ** 2).sum()))
+        far = near[c, 0] if rank > 0 else positions[c, 2]  # over the board's own plane
         memory.reach_m[s] = ERROR_REACH * far if is_finite else -1.0
         memory.among[s] = near[c, 1]
     return is_finite
