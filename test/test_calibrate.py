@@ -230,5 +230,8 @@ def test_a_reversed_sensor_of_a_scan_is_used_and_what_no_field_explains_refused(
     assert (record.name, record.parameters) == ('sensor_polarity', {'channels': channels})
     assert found.residuals.rmse_t == pytest.approx(right.residuals.rmse_t)
     check_explained(right)
+    apart = replace(right.held_out, error=right.held_out.error + 0.1 * right.residuals.read_t)
+    with pytest.raises(FitError, match=r'10 % of the signal is left.*sessions of its own'):
+        check_explained(replace(right, held_out=apart))  # its parts contradict each other
     with pytest.raises(FitError, match=r'no field explains the scan: \d+ % of the signal'):
         check_explained(none)

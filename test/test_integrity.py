@@ -14,6 +14,7 @@ from anser_ros.integrity.pose_checks import Continuity, Place
 from anser_ros.physics.rotations import rotation_of_vector
 from anser_ros.settings import ToolSettings
 from anser_ros.tracking.estimate import TrackerSettings
+from anser_ros.tracking.rigid import BodySolution
 from anser_ros.tracking.tracker import Tracker
 
 SEED = 7
@@ -165,6 +166,21 @@ def test_a_gain_that_all_coils_have_in_common_is_in_every_sigma(rng, gain, learn
             assert wrong_and_ok(found, place, rotation) == []
             sigma[now] = found[-1].sigma_position_m
     assert sigma[1.0] < 1e-4 and (learns or sigma[gain] > 5e-4)
+
+
+@pytest.mark.parametrize(('told', 'off', 'counts'), [
+    (0.0, 0.0, 0.87e-3),  # one chance in a hundred of 1 %, less what nobody reckons with
+    (1e7, 0.0, 0.0), (1e7, 0.02, 0.02), (1e7, 3e-4, 0.0), (1e6, 5e-3, 5e-3),
+])  # fmt: skip
+def test_a_common_gain_counts_as_far_as_it_may_have_changed(told, off, counts):
+    """``told`` is what readings tell of it, ``off`` by how much it has changed."""
+    rows = np.zeros((8, 10))
+    rows[1:7, 1:7] = np.eye(6)
+    rows[7, 8] = np.sqrt(told)
+    rows[0] = off * rows[7]
+    nothing = np.zeros(0)
+    body = BodySolution(*[nothing] * 2, 0.0, *[nothing] * 3, True, rows, np.zeros((0, 10)))
+    assert body.gain(np.eye(6))[0] == pytest.approx(counts, rel=0.1, abs=1e-5)
 
 
 def test_a_survey_as_wrong_as_is_stated_contradicts_nothing(rng):

@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tracked_tool import CHANNELS, MODEL, STEP_NS, TOOL, one_frame
 from tracking_world import NOISE_T, fluxes, random_pose
 
 from anser_ros import pose_states as states
 from anser_ros.errors import TrackingError
-from anser_ros.field.model import EffectRecord
+from anser_ros.field.model import EffectRecord, OpenArm, from_document, to_document
 from anser_ros.tracking.estimate import NO_GATE, NoiseScale, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 
@@ -131,6 +132,22 @@ def test_a_shift_of_the_whole_field_is_in_every_sigma_and_refuses_no_pose(rng):
         assert one.state == 'ok'
         assert np.allclose(one.covariance - sure[name].covariance, np.diag([49e-6] * 3 + [0] * 3))
         assert one.sigma_position_m == pytest.approx(np.sqrt(np.trace(one.covariance[:3, :3])))
+
+
+def test_a_lever_arm_that_no_turn_told_counts_where_the_tool_is_turned_otherwise(rng):
+    position, rotation = random_pose(rng)
+    flux, half = fluxes(MODEL, TOOL, position, rotation, rng), np.diag([-1.0, -1.0, 1.0])
+    sigma = {}
+    for name, scanned in (('alike', rotation), ('turned', rotation @ half)):
+        model = replace(
+            MODEL, shift_sigma_m=5e-3, open_arms={'tool_a': OpenArm(4e-3, scanned)}
+        ).turned(Rotation.identity(), np.zeros(3))
+        again = from_document(to_document(model))
+        found = one_frame(Tracker(again, TOOL), flux, 10**12)
+        sigma[name] = [found[one].sigma_position_m ** 2 for one in ('tool_a', TOOL.name[0])]
+    # Beside the arm 3 mm are open along each axis; half a turn moves two of them by twice the arm.
+    assert np.allclose(sigma['alike'], 27e-6, atol=1e-6)
+    assert np.allclose(sigma['turned'], 27e-6 + 2 * 64e-6, atol=1e-6)
 
 
 def test_the_gate_is_where_the_settings_say(rng):

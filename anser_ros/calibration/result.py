@@ -268,6 +268,7 @@ class Residuals:
     each_t: Array  # (K,): root mean square of the magnitude of each emitter's complex residual, T
     span_t: float  # range of the measured in-phase fluxes, T
     unexplained: float  # median magnitude of a residual over that of a reading
+    read_t: float  # root mean square of the magnitude of a reading, T
 
     @property
     def rmse_t(self) -> float:
@@ -279,7 +280,8 @@ class Residuals:
         """Return what is ``left`` of what was ``read``, both (N, K), T."""
         size, whole = np.abs(left), np.abs(read)
         each_t, span_t = np.sqrt((size**2).mean(axis=0)), np.ptp(read.real)
-        return cls(each_t, float(span_t), float(np.median(size) / np.median(whole)))
+        share = float(np.median(size) / np.median(whole))
+        return cls(each_t, float(span_t), share, float(np.sqrt((whole**2).mean())))
 
 
 def residuals(measurements: Sequence[Measurements], model: FieldModel) -> Residuals:

@@ -75,6 +75,7 @@ from anser_ros.calibration.sensor_parameters import (
     CLOCKS,
     EACH,
     PRIOR,
+    SHARED_SHIFT,
     STANDS,
     SURVEYED_M,
     USEFUL,
@@ -181,6 +182,7 @@ class SensorFit:
     shift_sigma_m: float = 0.0
     # of which parameters two sessions say different things
     contradictions: tuple[Contradiction, ...] = ()
+    open_arm_m: float = 0.0  # of the lever arm in that shift, where the scan does not determine it
 
     def errors_of(self, body: str, session: str = '') -> BodyErrors:
         """Return the errors of a body's sensors in a session."""
@@ -328,11 +330,13 @@ class SensorFitter:
         kept, reflected = self._all_frames(steady)
         mean = self.optical.mean_sigma_m(sum(int(mask.sum()) for mask in kept))
         shift = self.population.shift_sigma_m(self.likelihood, whole, self.surveyed_m)
+        undetermined = self._undetermined()
         return SensorFit(
             self.parameters, posterior, left_out, evidence, self.noise_t, self.optical,
-            self.population.alone, kept, steady, reflected, self._undetermined(),
+            self.population.alone, kept, steady, reflected, undetermined,
             float(np.hypot(np.hypot(mean, shift), self.alike_m)),
             self._contradictions(tools, tuple(evidence)),
+            shift if SHARED_SHIFT in undetermined else 0.0,
         )  # fmt: skip
 
     def _sums(

@@ -259,6 +259,14 @@ def parse_gaps(document: Any) -> ScanGaps:
     return ScanGaps(table[:, :3].copy(), table[:, 3:6].copy(), table[:, 6:].T.copy())
 
 
+@dataclass(frozen=True)
+class OpenArm:
+    """States how a body stood, whose lever arm its scan does not determine."""
+
+    sigma_m: float  # standard deviation of the arm along each axis, in the model's shift
+    turn: Array  # (3, 3), mean of the rotation matrices of the scan, body to fg
+
+
 SCHEMA = 'anser_model/1'
 SESSION = 'session'
 """Parameter of an effect that holds in one of several sessions alone: its name."""
@@ -315,6 +323,8 @@ class FieldModel:
     # standard deviation along each axis, m, of a shift that all places in the field share: what
     # the calibration could not tell between the field and where the tool's sensors are
     shift_sigma_m: float = 0.0
+    # by body, for those whose lever arm is part of that, how they stood then
+    open_arms: Mapping[str, OpenArm] = field(default_factory=dict)
     # by how much the field may be off where the scan has gaps, beyond ``flux_error_t``. Only a
     # diagnosis reads it; no pose follows from it
     gaps: ScanGaps | None = None
@@ -349,6 +359,7 @@ class FieldModel:
                 self.flux_error_t, self.modes,
                 [[effect.name, plain(dict(effect.parameters))] for effect in self.effects],
                 *(value for value in (self.shift_sigma_m, self.noise_t) if value),
+                *(part for arm in self.open_arms.values() for part in (arm.sigma_m, arm.turn)),
             ]
         )  # fmt: skip
 
@@ -382,8 +393,21 @@ class FieldModel:
             place, direction = turn.apply(one.positions) + shift, turn.apply(one.directions)
             return replace(one, positions=place, directions=direction)
 
-        whole: FieldModel = stands(self)
+        arms = {b: OpenArm(a.sigma_m, turn.apply(a.turn.T).T) for b, a in self.open_arms.items()}
+        whole: FieldModel = replace(stands(self), open_arms=arms)
         return whole if self.gaps is None else replace(whole, gaps=stands(self.gaps))
+
+    def shift_covariance(self, body: str, rotation: Array | None) -> Array:
+        """Return the covariance (3, 3), m^2, of the shift of a body turned so, and of its coils.
+
+        An open lever arm's error has shifted the field as the scan had the body. A pose is off by
+        what the arm's error is now beside that: by nothing where the body is turned as it was.
+        """
+        covariance, arm = self.shift_sigma_m**2 * np.eye(3), self.open_arms.get(body)
+        if arm is not None and rotation is not None:
+            away = arm.turn - rotation
+            covariance += arm.sigma_m**2 * (away @ away.T - np.eye(3))
+        return covariance
 
     def with_dipoles(
         self, positions: Array, directions: Array, moments: ComplexArray
@@ -426,6 +450,8 @@ def to_document(model: FieldModel) -> dict[str, Any]:
         + [f'm{k}_{part}' for k in range(len(model.emitters)) for part in ('re', 'im')],
         'dipoles': table.tolist(),
     }
+    if model.open_arms:
+        document['open_arms'] = plain({body: asdict(a) for body, a in model.open_arms.items()})
     if model.references is not None:
         document['references'] = readings_document(model.references)
     if model.gaps is not None:
@@ -481,9 +507,13 @@ def from_document(document: Any) -> FieldModel:
         flux_error = float(document.get('flux_error_t', 0.0))
         shift_sigma = float(document.get('shift_sigma_m', 0.0))
         noise, share = (float(document.get(key, 0.0)) for key in ('noise_t', 'error_share'))
+        arms = {
+            str(body): OpenArm(float(arm['sigma_m']), np.array(arm['turn'], float).reshape(3, 3))
+            for body, arm in dict(document.get('open_arms') or {}).items()
+        }
     except (KeyError, TypeError, ValueError) as error:
         raise ModelFileError(
-            f'model: an emitter, flux_error_t, noise_t or shift_sigma_m is malformed: {error}'
+            f'model: an emitter, error, noise_t, shift_sigma_m or open_arms is malformed: {error}'
         ) from error
     k = len(names)
     table = _table(document.get('dipoles'), 6 + 2 * k, 'dipoles')
@@ -511,6 +541,7 @@ def from_document(document: Any) -> FieldModel:
         frequencies_hz=frequencies,
         flux_error_t=flux_error,
         shift_sigma_m=shift_sigma,
+        open_arms=arms,
         noise_t=noise,
         error_share=share,
         modes=modes,

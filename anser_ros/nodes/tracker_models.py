@@ -123,7 +123,7 @@ class ModelReader:
             raise LayoutError(f'the field model has {count} emitters, the setup {len(names)}')
         kept: dict[str, Any] = {}
         if own is not None:
-            of_own = 'flux_error_t', 'shift_sigma_m', 'effects'
+            of_own = 'flux_error_t', 'shift_sigma_m', 'open_arms', 'effects'
             kept = {name: getattr(own, name) for name in of_own}
         if error is not None:
             modes = error.modes if len(error.modes) else None

@@ -19,6 +19,7 @@ from anser_ros.arrays import Booleans, ComplexArray
 from anser_ros.calibration import disturbances
 from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan
 from anser_ros.calibration.drawn_fit import FINE
+from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.readings import check_single_coils, with_pose
@@ -49,8 +50,9 @@ FIELD_REACH_M = 0.015
 ASIDE = 0.3
 """Distance of a look's free dipoles at the wiring from each emitter's middle, in its sides."""
 MOST_UNEXPLAINED = 0.05
-"""Share of most readings that a calibration leaves at most: good ones leave a thousandth, those of
-a layout that is too coarse a hundredth, wrong signs or poses a tenth and more."""
+"""Share of the readings that a calibration leaves at most: good ones leave a thousandth, those of
+a layout that is too coarse a hundredth, wrong signs or poses, or a source moved by 5 mm, a tenth
+and more."""
 UNCERTAINTY_FRAMES = 60
 """Frames of a tool, about, in which the uncertainty of the metal at rest is worked out."""
 
@@ -305,12 +307,16 @@ def _with_faults(scan: Scan, faults: Sequence[Term]) -> Scan:
 
 
 def check_explained(calibration: Calibration) -> None:
-    """Raise `FitError` where a model leaves so much of most readings that it is none."""
-    share = calibration.residuals.unexplained
+    """Raise `FitError` where a model leaves so much of the readings that it is none: of most of
+    them, or where parts of the scan are predicted by the others.
+    """
+    left = calibration.residuals
+    share = max(left.unexplained, rms(calibration.held_out.error) / left.read_t)
     if share > MOST_UNEXPLAINED:
         raise FitError(
             f'no field explains the scan: {100 * share:.0f} % of the signal is left. Are axes, '
-            'places or poses stated wrongly, or coils exchanged?'
+            'places or poses stated wrongly, coils exchanged, or was a source or sensor put '
+            'elsewhere in between? What stands differently belongs into sessions of its own'
         )
 
 

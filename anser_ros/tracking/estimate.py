@@ -144,10 +144,9 @@ class PoseEstimate:
         matrix = self.covariance
         return math.sqrt(matrix[0, 0] + matrix[1, 1] + matrix[2, 2])
 
-    def add_shift(self, sigma_m: float) -> None:
-        """Add a shift, m along each axis, to the covariance, a matrix that is no other's."""
-        for i in range(3):
-            self.covariance[i, i] += sigma_m**2
+    def add_shift(self, covariance: Array) -> None:
+        """Add a shift's covariance (3, 3), m^2, to the estimate's, a matrix that is no other's."""
+        self.covariance[:3, :3] += covariance
 
 
 def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) -> PoseEstimate:

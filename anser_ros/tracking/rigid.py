@@ -28,7 +28,7 @@ from anser_ros.tracking.descent import (
     limit_step,
 )
 from anser_ros.tracking.seed import SeedGrid
-from anser_ros.tracking.solve import COMMON_GAIN, LEAST_GAIN, RealField
+from anser_ros.tracking.solve import COMMON_GAIN, GAIN_CHANGES, LEAST_GAIN, RealField
 
 
 @inlined
@@ -276,16 +276,19 @@ class BodySolution:
     def gain(self, covariance: Array) -> tuple[float, Array]:
         """Return what a gain of all coils may be off by, and what a gain does to the pose (6,).
 
-        The first is the root of the mean square of its posterior beyond `LEAST_GAIN`, for a prior
-        deviation of `COMMON_GAIN`; the second is in m and rad, ``covariance`` (6, 6) the pose's.
+        The first is the root of the mean square of its posterior beyond `LEAST_GAIN`: it has
+        changed with a probability of `GAIN_CHANGES`, then by `COMMON_GAIN`. The second is in m
+        and rad, ``covariance`` (6, 6) the pose's.
         """
         shared = self.rows @ self.common.T
         products = self.rows @ self.rows.T - shared @ shared.T
         carried = covariance @ products[1:7]
         information = products[7, 7] - products[7, 1:7] @ carried[:, 7]
-        score = products[7, 0] - products[7, 1:7] @ carried[:, 0]
+        score = float(products[7, 0] - products[7, 1:7] @ carried[:, 0])
         variance = 1.0 / (max(float(information), 0.0) + COMMON_GAIN**-2)
-        square = (variance * float(score)) ** 2 + variance - LEAST_GAIN**2
+        odds = GAIN_CHANGES / (1.0 - GAIN_CHANGES) * math.sqrt(variance) / COMMON_GAIN
+        changed = 1.0 / (1.0 + math.exp(-0.5 * variance * score**2) / odds)
+        square = changed * ((variance * score) ** 2 + variance) - LEAST_GAIN**2
         return math.sqrt(max(square, 0.0)), carried[:, 7]
 
 

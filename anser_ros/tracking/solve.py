@@ -222,9 +222,13 @@ def coil_covariance(normal, axis, roll_variance):  # type: ignore[no-untyped-def
 
 
 COMMON_GAIN = 0.01
-"""Standard deviation of a gain that all coils of a tool have in common, as by one amplifier or by
-the emitters' supply, before the coils say anything. Nine coils with eight emitters know it to 3e-4
-in one frame at 0.25 m."""
+"""Standard deviation of a gain that all coils of a tool have in common where it has changed, as by
+one amplifier or by the emitters' supply. Nine coils with eight emitters know it to 3e-4 in one
+frame at 0.25 m."""
+GAIN_CHANGES = 0.01
+"""Probability that it has changed, before the coils say anything: as of a coil by itself
+(`pose_checks.FAILS_ALONE`). Where no reading tells, it may be off by a thousandth then: a tracker
+of measured/ilemt changed by 0.07 % from one recording to the next, most do by less."""
 LEAST_GAIN = 5e-4
 """Common gain that nobody reckons with: it moves no pose by 0.1 mm, and its noise is 1e-4."""
 

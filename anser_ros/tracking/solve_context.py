@@ -275,7 +275,6 @@ class SolveContext:
     model_id: str
     # Part of the expected residual's power that is the model's own error, the modes aside
     model_share: float
-    shift_sigma_m: float  # The model's
     # (2K, Q), relative errors of the emitters' strengths, of one standard deviation each, real and
     # imaginary part by turns; (0, 0) where these are the model's
     strengths: Array
@@ -400,10 +399,7 @@ def build_context(
     else:
         starts = previous.starts.following()
     share = 1.0 - settings.flux_noise_t**2 / variance
-    return SolveContext(
-        field, sigma, modes, starts, low, high, name, share, float(model.shift_sigma_m),
-        AS_THEY_ARE,
-    )  # fmt: skip
+    return SolveContext(field, sigma, modes, starts, low, high, name, share, AS_THEY_ARE)
 
 
 FEWEST_EMITTERS = 6

@@ -335,10 +335,14 @@ class Tracker:
             looks = self._looks(frames, bodies, coils, values, context)
             self._past.strengths.learn(stamp_ns, looks)
         judged = self._past.judgement.judged(stamp_ns, coils, bodies, self.settings)
-        if context.shift_sigma_m > 0.0:
+        model = self.model
+        if model is not None and model.shift_sigma_m > 0.0:
             # No judge reckons with it: what all poses share contradicts none of them.
-            for estimate in judged:
-                estimate.add_shift(context.shift_sigma_m)
+            names, shift = (*self._scene.table.body, *self._scene.bodies), model.shift_covariance
+            turns = dict(zip(names, (one.rotation for one in judged), strict=True))
+            shifts = {name: shift(name, turn) for name, turn in turns.items()}
+            for name, one in zip(names, judged, strict=True):
+                one.add_shift(shifts[name])
         return judged
 
     def _looks(
