@@ -319,9 +319,11 @@ class Correction:
         """Fixed point of ``x = measured - (compress(x) - x)``; at most half of x is corrected."""
         x = measured
         for _ in range(DECOMPRESSION_STEPS):
-            behind = x[None]
+            behind = whole = x[None]
             for term in terms:
                 behind = term.effect.compress(term, channels, behind)
+            if behind is whole:  # nothing compresses
+                return measured
             loss = behind[0] - x
             most = 0.5 * np.abs(measured)
             share = most / np.maximum(np.abs(loss), np.maximum(most, 1e-300))

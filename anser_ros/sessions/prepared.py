@@ -38,6 +38,10 @@ def settings_for(
     )
 
 
+STOOD_FRAMES = 100
+"""Frames, about, that tell which of a model's sessions another stands like, by a median."""
+
+
 @dataclass(frozen=True)
 class PreparedSession:
     """Holds a session and a model that fits it, with what follows from the two.
@@ -116,18 +120,16 @@ def as_it_stood(model: FieldModel, session: Session) -> FieldModel:
     knows no such difference, it stands in between, as it was written.
     """
     every = list(dict.fromkeys(filter(None, (e.parameters.get(SESSION) for e in model.effects))))
-    tools = [tool for tool in map(with_pose, session.tools) if len(tool.time)]
-    if not every or not tools:
+    posed = [tool for tool in map(with_pose, session.tools) if len(tool.time)]
+    if not every or not posed:
         return model
-    stood = [_stood(model, name) for name in every]
-    whole = replace(session, tools=tuple(tools))
+    tools = [m.frames(np.arange(0, len(m.time), 1 + len(m.time) // STOOD_FRAMES)) for m in posed]
 
     def left(one: FieldModel) -> float:
-        correction, recorded = _correction(one, session), is_recorded(one, session)
-        found = [_corrected(correction, recorded, tool) for tool in whole.tools]
-        return residuals(found, one).unexplained
+        how = _correction(one, session), is_recorded(one, session)
+        return residuals([_corrected(*how, tool) for tool in tools], one).unexplained
 
-    return min(stood, key=left)
+    return min((_stood(model, name) for name in every), key=left)
 
 
 def _stood(model: FieldModel, name: str) -> FieldModel:
