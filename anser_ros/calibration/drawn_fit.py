@@ -14,7 +14,7 @@ only the prior holds. They are stated apart (`FieldModel.shift_sigma_m`).
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -101,8 +101,8 @@ KINDS = {
     'rest': slice(11, None),
 }
 """Where the parameters of these kinds stand among a coil's own."""
-OWN = 11 + REST_MODES
-"""Parameters of a coil."""
+OWN = 11
+"""Parameters of a coil, before those of the kind `rest`."""
 SHAPES = np.array([[[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
 """Changes of a flat coil's shape by one unit, in its own frame: larger, longer in x than in y, and
 longer along one diagonal than the other. What artwork lacks of its turns is one of them."""
@@ -123,11 +123,12 @@ def _carried(places: Array, middle: Array) -> Array:
 class Drawing:
     """A board's drawing as N dipoles, coil by coil, and L more for what it lacks.
 
-    The errors of its K coils are a table (K, `OWN`): shift (m), turn (rad) about the centre,
-    complex strength less one, `SHAPES`, and amplitudes of the combinations of the L dipoles.
+    The errors of its K coils are a table (K, `OWN` + ``modes``): shift (m), turn (rad) about the
+    centre, complex strength less one, `SHAPES`, and amplitudes of combinations of the L dipoles,
+    which are left out with them where ``modes`` is zero.
     """
 
-    def __init__(self, generator: Generator) -> None:
+    def __init__(self, generator: Generator, modes: int) -> None:
         assert generator.nominal is not None
         self.nominal, self.centres = generator.nominal, generator.centres
         self.owner = np.argmax(np.abs(self.nominal.moments), axis=1)
@@ -136,14 +137,16 @@ class Drawing:
         ways = np.einsum('kij,sjl,kml->ksim', frames, SHAPES, frames)[self.owner]
         self.shapes = np.zeros((len(self.arms), 3, len(SHAPES)))
         self.shapes[:, :2] = np.einsum('nsij,nj->nis', ways, self.arms[:, :2])
-        self.layer = place(REST_LAYER, generator)
+        layer = place(REST_LAYER, generator)
         square = grid(9, 1.6 * generator.half_extent)
         flat = generator.middle + np.column_stack([square, np.zeros(len(square))])
         self.places = (flat + HEIGHTS_M[:, None, None] * [0.0, 0.0, 1.0]).reshape(-1, 3)
         self.lattice = along_each_axis(self.places)
-        made = flux_basis(*self.lattice, None, self.layer.positions, self.layer.directions)
+        made = flux_basis(*self.lattice, None, layer.positions, layer.directions)
         size = float(np.abs(self.nominal.moments.sum(axis=0)).mean())
-        self.rest = size * np.linalg.svd(made, full_matrices=False)[2][:REST_MODES].T
+        used = slice(len(layer) if modes else 0)
+        self.layer = DipoleSites(layer.positions[used], layer.directions[used])
+        self.rest = size * np.linalg.svd(made, full_matrices=False)[2][:modes].T[used]
 
     def dipoles(self, errors: Array) -> Dipoles:
         """Return the dipoles (N + L) of a board with such errors."""
@@ -159,10 +162,10 @@ class Drawing:
         )
 
     def columns(self, errors: Array) -> ComplexArray:
-        """Return the moments (K, N + L, OWN) of the same dipoles by each coil's own errors."""
+        """Return the moments (K, N + L, Q) of the same dipoles by each coil's Q own errors."""
         here, out = self.dipoles(errors), []
         sites = DipoleSites(here.positions, here.directions)
-        rest = np.concatenate([np.zeros((len(self.owner), REST_MODES)), self.rest])
+        rest = np.concatenate([np.zeros((len(self.owner), self.rest.shape[1])), self.rest])
         for k in range(len(errors)):
             pairs = []
             for j in (*range(6), *range(8, 11)):
@@ -191,6 +194,9 @@ class _Part:
     offset: Array  # (F, 6): of the poses from those stated on the plate
     weights: Array  # (F, S)
     now: Measurements  # corrected by the present estimate
+    # their residuals, and fluxes with the derivatives by coils' places and axes, at that estimate
+    terms: PoseTerms = field(init=False)
+    made: tuple[ComplexArray, ComplexArray, ComplexArray] = field(init=False)
 
 
 @dataclass(frozen=True)
@@ -210,7 +216,7 @@ class DrawnFit:
     """Holds a fitted board with what is known of it."""
 
     model: FieldModel  # without corrections of sensors; its modes are what is open but the frame
-    errors: Array  # (K, OWN): of the coils, and their standard deviations
+    errors: Array  # (K, Q): of the coils, and their standard deviations
     sigma: Array
     changes: Array  # (K,), by how much coils became stronger while they were read, relative
     # (6,), m and rad: of a motion of all coils as one, about the middle of the drawing's places
@@ -232,6 +238,7 @@ class DrawnFitter:
     """Fits a drawn board and the errors of sensors, plate and poses.
 
     ``measurements``: all frames with a pose, stated or to start from, as ``typed`` says of each.
+    ``modes``: of what the drawing lacks.
     """
 
     def __init__(
@@ -241,8 +248,9 @@ class DrawnFitter:
         generator: Generator,
         kinds: Sequence[str],
         noise_t: float,
+        modes: int = REST_MODES,
     ) -> None:
-        self.drawing, self.noise_t, self.jitter = Drawing(generator), noise_t, PLACE
+        self.drawing, self.noise_t, self.jitter = Drawing(generator, modes), noise_t, PLACE
         # A single coil's place and gain are the plate's and the board's.
         one = all(len(m.sensors) == 1 for m in measurements)
         kept = [kind for kind in kinds if kind in SENSORS and (kind == 'axes' or not one)]
@@ -250,15 +258,16 @@ class DrawnFitter:
         self.sensors = SensorParameters(measurements, kept, tones, is_free=False)
         self.parts = list(_parts(measurements, typed))
         self.middle = np.mean(np.concatenate([p.stated.position for p in self.parts]), axis=0)
-        self.count, self.courses = len(generator.centres), StrengthCourses(measurements)
-        changing = self.count * self.courses.count
-        ends = np.cumsum([OWN * self.count, changing, LEVEL.size, 7, len(self.sensors)]).tolist()
+        self.count, self.each = len(generator.centres), OWN + modes
+        self.courses = StrengthCourses(measurements)
+        own, changing = self.each * self.count, self.count * self.courses.count
+        ends = np.cumsum([own, changing, LEVEL.size, 7, len(self.sensors)]).tolist()
         self.own, self.changing, self.level, self.plate, self.sensed = (
             slice(*pair) for pair in zip([0, *ends[:4]], ends, strict=True)
         )
         self.values, self.width, self.scale = (np.zeros(ends[4]) for _ in range(3))
         self.width[self.level], self.width[self.plate] = LEVEL, PLATE
-        table = np.arange(OWN * self.count).reshape(self.count, OWN)
+        table = np.arange(self.each * self.count).reshape(self.count, self.each)
         arms = generator.centres - generator.middle
         self.scale[table[:, :3].ravel()] = arms.ravel() / (arms**2).sum()
         self.rest, start = table[:, KINDS['rest']].ravel(), self.sensed.start
@@ -291,7 +300,6 @@ class DrawnFitter:
 
         What the drawing lacks is left to moments of their own that they get.
         """
-        self.width[self.rest] = NONE
         self._settle(PLACING_STEPS)
         shift, turn, scale = np.split(self.values[self.plate], [3, 6])
         back, own = _turned(turn), slice(len(self.drawing.owner))
@@ -307,8 +315,8 @@ class DrawnFitter:
         return self._model(solve(likelihood, self.width).covariance)[0]
 
     def errors(self, values: Array) -> Array:
-        """Return the coils' errors (K, OWN) with what they share."""
-        errors = values[self.own].reshape(self.count, OWN).copy()
+        """Return the coils' errors (K, Q) with what they share."""
+        errors = values[self.own].reshape(self.count, -1).copy()
         (real, imaginary), shape = np.split(values[self.level], [2])
         strength = (1.0 + errors[:, 6] + 1j * errors[:, 7]) * (1.0 + real + 1j * imaginary)
         errors[:, 6], errors[:, 7] = strength.real - 1.0, strength.imag
@@ -322,6 +330,7 @@ class DrawnFitter:
         self.dipoles = self.drawing.dipoles(self.board)
         shift, turn, scale = np.split(values[self.plate], [3, 6])
         rotation = _turned(turn)
+        sites = DipoleSites(self.dipoles.positions, self.dipoles.directions)
         for part in self.parts:
             there = part.stated
             if part.is_typed:
@@ -332,38 +341,32 @@ class DrawnFitter:
             errors = self.sensors.errors_of(there.body, values[self.sensed])
             now = moved(errors.apply(there), part.offset)
             strengths = self.courses.strengths(now, self.changes)
-            part.now = replace(now, flux=now.flux / strengths[:, None])
-
-    def _terms(self, now: Measurements) -> tuple[PoseTerms, tuple[ComplexArray, ...]]:
-        """Residuals of frames, with fluxes and their derivatives by coils' places and axes."""
-        sites = DipoleSites(self.dipoles.positions, self.dipoles.directions)
-        made = flux_slopes(now, sites, self.dipoles.moments)
-        points, axes = now.placed()
-        slope = pose_slopes(points, axes, now.position, *made[1:])
-        return PoseTerms(as_real(now.flux) - as_real(made[0]), slope), made
+            part.now = now = replace(now, flux=now.flux / strengths[:, None])
+            part.made = flux_slopes(now, sites, self.dipoles.moments)
+            slope = pose_slopes(*now.placed(), now.position, *part.made[1:])
+            part.terms = PoseTerms(as_real(now.flux) - as_real(part.made[0]), slope)
 
     def _sums(self, part: _Part) -> _Sums:
-        now, size = part.now, self.values.size
-        terms, made = self._terms(now)
+        size, terms = self.values.size, part.terms
         jitter = self.jitter if part.is_typed else FREE
         white = PoseWhitener(terms.slope, part.weights, self.noise_t, jitter**-2.0)
-        by_shape = self._by_shape(now, made[0])
-        shared = self._shared(part, terms, made, by_shape)
+        by_shape = self._by_shape(part.now, part.made[0])
+        shared = self._shared(part, by_shape)
         root, (frames, sensors) = np.sqrt(part.weights) / self.noise_t, part.weights.shape
-        slope = white.slope.reshape(frames, sensors, -1, 6)
+        slope = white.slope.reshape(frames, 6, sensors, -1)
         normal, gradient = np.zeros((size, size)), np.zeros(size)
         mixed = np.zeros((frames, 6, size))
-        for k, own in enumerate(self._of_coils(now, made, by_shape)):
+        for k, own in enumerate(self._of_coils(part, by_shape)):
             pair = slice(2 * k, 2 * k + 2)
             rows = np.concatenate([own, shared[:, :, pair]], axis=3) * root[:, :, None, None]
             rows = rows.reshape(frames, 2 * sensors, -1)
             changes = self.changing.start + self.courses.count * (k + np.arange(2))
-            at = np.r_[OWN * k : OWN * (k + 1), slice(*changes), self.level.start : size]
+            own_rows = slice(self.each * k, self.each * (k + 1))
+            at = np.r_[own_rows, slice(*changes), self.level.start : size]
             flat = rows.reshape(-1, at.size)
             normal[np.ix_(at, at)] += flat.T @ flat
             gradient[at] += flat.T @ (terms.residual[:, :, pair] * root[:, :, None]).ravel()
-            along = slope[:, :, pair].reshape(frames, -1, 6)
-            mixed[:, :, at] += along.transpose(0, 2, 1) @ rows
+            mixed[:, :, at] += slope[..., pair].reshape(frames, 6, -1) @ rows
         answer = white.inverse @ mixed
         step = white.step(terms.residual, part.offset)
         flat_mixed = mixed.reshape(-1, size)
@@ -376,16 +379,14 @@ class DrawnFitter:
         """Derivatives (F, S, K, 3) of fluxes by the shape of the windings."""
         points, axes = (of_all.reshape(-1, 3) for of_all in now.placed())
         lengths, out = np.tile(now.sensors.length, len(now.time)), []
-        for unit in np.eye(OWN)[KINDS['shape']]:
+        for unit in np.eye(self.each)[KINDS['shape']]:
             made = self.drawing.dipoles(self.board + STEP * unit).flux(points, axes, lengths)
             out.append((made.reshape(flux.shape) - flux) / STEP)
         return np.stack(out, axis=-1)
 
-    def _shared(
-        self, part: _Part, terms: PoseTerms, made: tuple[ComplexArray, ...], by_shape: ComplexArray
-    ) -> Array:
+    def _shared(self, part: _Part, by_shape: ComplexArray) -> Array:
         """Derivatives (F, S, 2K, .) by what all coils share: level, plate and sensors."""
-        now, flux = part.now, made[0]
+        now, flux = part.now, part.made[0]
         whole = (flux, 1j * flux, *np.moveaxis(by_shape, -1, 0))
         level = np.stack([as_real(one) for one in whole], axis=-1)
         ways = np.zeros((len(now.time), 6, 7))
@@ -393,18 +394,14 @@ class DrawnFitter:
             ways[:, :3, :6] = _carried(now.position, self.middle)
             ways[:, 3:, 3:6] = np.eye(3)
             ways[:, :3, 6] = now.position - self.middle
-        plate = np.einsum('fsci,fij->fscj', terms.slope, ways, optimize=True)
+        plate = np.einsum('fsci,fij->fscj', part.terms.slope, ways, optimize=True)
         still = np.zeros((len(now.time), 6))
-        by_sensors = as_real(
-            self.sensors.derivatives(now, made[0], made[1], made[2], still)
-        ).transpose(0, 1, 3, 2)
-        return np.concatenate([level, plate, by_sensors], axis=3)
+        by_sensors = as_real(self.sensors.derivatives(now, *part.made, still))
+        return np.concatenate([level, plate, by_sensors.transpose(0, 1, 3, 2)], axis=3)
 
-    def _of_coils(
-        self, now: Measurements, made: tuple[ComplexArray, ...], by_shape: ComplexArray
-    ) -> Iterator[Array]:
+    def _of_coils(self, part: _Part, by_shape: ComplexArray) -> Iterator[Array]:
         """Yield the derivatives (F, S, 2, .) of each coil's fluxes by its errors and changes."""
-        flux, by_place, by_axis = made
+        now, (flux, by_place, by_axis) = part.now, part.made
         (points, axes), ways = now.placed(), self.courses.of(now)
         rest = (basis_rows(now, self.drawing.layer) @ self.drawing.rest).reshape(
             *flux.shape[:2], -1
@@ -465,7 +462,7 @@ class DrawnFitter:
         """Weigh the readings, and estimate the noise, less ``used`` degrees of freedom."""
         power = count = 0.0
         for part in self.parts:
-            left = self._terms(part.now)[0].residual
+            left = part.terms.residual
             if is_learning:
                 part.weights = outlier_weights(left, usable_weights(part.now))
             power += float((part.weights[:, :, None] * left**2).sum())
@@ -480,7 +477,7 @@ class DrawnFitter:
         for part in self.parts:
             rest = [s for s, p in zip(sums, self.parts, strict=True) if p.fold != part.fold]
             self._place(solve(self._likelihood(rest), self.width).values)
-            held_out.append(self._terms(part.now)[0])
+            held_out.append(part.terms)
         # A gain that all sensors share is the board's.
         gains, common = self.sensors.by_rule(found.values[self.sensed])
         level = (1.0 + found.values[self.level][:2] @ [1.0, 1j]) * common
@@ -501,7 +498,7 @@ class DrawnFitter:
         each = [self.courses.strengths(part.now, self.changes) for part in self.parts]
         last = np.argmax(np.concatenate([part.now.time for part in self.parts]))
         return DrawnFit(
-            model, self.board, found.sigma[self.own].reshape(self.count, OWN),
+            model, self.board, found.sigma[self.own].reshape(self.count, -1),
             np.concatenate(each)[last].real - 1.0, frame_sigma, found.values[self.plate],
             self.sensors, sensed, evidence, self.noise_t, self.jitter, tuple(self.parts),
             tuple(held_out),
@@ -518,14 +515,14 @@ class DrawnFitter:
         for phase, rows in enumerate(first.reshape(-1, 2).T):
             known[self.level.start + phase, rows] = 1.0 / max(len(rows), 1)
         covariance = known @ covariance @ known.T
-        drawing, here, size = self.drawing, self.dipoles, OWN * self.count
+        drawing, here, each, size = self.drawing, self.dipoles, self.each, self.own.stop
         columns = drawing.columns(self.board)
         basis = flux_basis(*drawing.lattice, None, here.positions, here.directions)
         lift = np.zeros((size, len(covariance)))
         lift[:, :size] = np.eye(size)
         for j in range(LEVEL.size):
-            lift[6 + j : size : OWN, self.level.start + j] = 1.0
-        motion = np.zeros((self.count, OWN, 6))
+            lift[6 + j : size : each, self.level.start + j] = 1.0
+        motion = np.zeros((self.count, each, 6))
         motion[:, :3] = _carried(drawing.centres + self.board[:, :3], self.middle)
         motion[:, 3:6, 3:] = np.eye(3)
         weight = 1.0 / np.linalg.norm(basis @ here.moments, axis=1)[:, None]
@@ -534,7 +531,7 @@ class DrawnFitter:
         whole = np.zeros((len(moving), size), complex)
         for k, block in enumerate(made):
             rows = slice(k * len(block), (k + 1) * len(block))
-            whole[rows, OWN * k : OWN * (k + 1)] = block
+            whole[rows, each * k : each * (k + 1)] = block
         to_motion = np.linalg.lstsq(as_rows(moving), as_rows(whole), rcond=None)[0]
         open_all = lift @ covariance @ lift.T
         frame = to_motion @ open_all @ to_motion.T
@@ -554,7 +551,7 @@ class DrawnFitter:
         values, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         _, turn = np.linalg.eigh((flux @ root).T @ (flux @ root))
-        best = (root @ turn[:, ::-1][:, :MOST_MODES]).reshape(self.count, OWN, -1)
+        best = (root @ turn[:, ::-1][:, :MOST_MODES]).reshape(self.count, self.each, -1)
         return np.ascontiguousarray((columns @ best).transpose(2, 1, 0))
 
 
@@ -581,7 +578,7 @@ def is_of_coils(nominal: FieldModel) -> bool:
 def drawn_where_read(measurements: Sequence[Measurements], generator: Generator) -> Dipoles:
     """Return the dipoles (N) of a drawing's coils where readings with a pose put them."""
     some = evenly(measurements)
-    return DrawnFitter(some, [True] * len(some), generator, (), 0.0).coils()
+    return DrawnFitter(some, [True] * len(some), generator, (), 0.0, modes=0).coils()
 
 
 def evenly(measurements: Sequence[Measurements]) -> list[Measurements]:

@@ -14,6 +14,7 @@ solved one by one then, in a small part of the time.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -24,6 +25,7 @@ from anser_ros.calibration.moments import PoseTerms, PoseWhitener, pose_slopes
 from anser_ros.calibration.readings import DipoleSites, basis_rows, flux_slopes, frame_blocks
 from anser_ros.calibration.sensor_parameters import SensorParameters, velocity_of
 from anser_ros.field.measurements import Measurements
+from anser_ros.parallel import in_order, slices
 
 LEAST_MOST_MODES, MOST_MODES = 160, 240
 """Modes of the field at most, for a scan of minutes and for a short one. What 160 miss of a wide
@@ -36,8 +38,8 @@ LEAST_MODE = 1e-8
 """Singular value of a mode at least, relative to the largest."""
 SYSTEM_ROWS = 1200
 """Readings in memory at a time: each has a row for every parameter."""
-POSE_ROWS = 1800
-"""Rows of the open poses, six a frame, that are subtracted together at least."""
+POSE_ROWS = 3000
+"""Rows of the open poses, six a frame, that are subtracted together at least: fewer are slow."""
 FAR_LESS, MOST_RATIO = 4.0, 1e3
 """Ratio of scatters from which on a kind of parameters is known better than the others: such as
 delays, which only show where nothing else does; and the most that is made of it."""
@@ -86,11 +88,17 @@ class Linear(PoseTerms):
     """Holds the readings of one body, at the present estimate, with all of their derivatives."""
 
     part: Measurements  # F frames, corrected by the present parameters
-    rows: Array  # (F, S, M): flux of each mode
+    modes: FieldModes  # M of them
     flux: ComplexArray  # (F, S, K): modelled, T
     # by_place, by_axis (F, S, 3, K): its derivatives by the sensors' places (T/m) and axes (T)
     by_place: ComplexArray
     by_axis: ComplexArray
+
+    @cached_property
+    def rows(self) -> Array:
+        """Return the flux of each mode, (F, S, M)."""
+        rows = basis_rows(self.part, self.modes.sites) @ self.modes.vectors
+        return rows.reshape(*self.flux.shape[:2], -1)
 
 
 def linearise(part: Measurements, modes: FieldModes, field: Array) -> Linear:
@@ -101,7 +109,7 @@ def linearise(part: Measurements, modes: FieldModes, field: Array) -> Linear:
         as_real(part.flux) - as_real(flux),
         pose_slopes(points, axes, part.position, by_place, by_axis),
         part,
-        (basis_rows(part, modes.sites) @ modes.vectors).reshape(*points.shape[:2], -1),
+        modes,
         flux,
         by_place,
         by_axis,
@@ -121,7 +129,7 @@ def open_directions(
     prior = 1.0 / (np.maximum(jitter, 1e-9) ** 2 * share[:, None])
     white = PoseWhitener(linear.slope, weights, noise_t, prior)
     # The inverse of the transposed factor is a root of the pose's covariance.
-    along = np.linalg.solve(np.linalg.cholesky(white.precision), white.slope.transpose(0, 2, 1))
+    along = np.linalg.solve(np.linalg.cholesky(white.precision), white.slope)
     return np.asarray(along.reshape(len(along), 6, *linear.slope.shape[1:3]))
 
 
@@ -153,45 +161,43 @@ class JointSystem:
     def add(self, linear: Linear, weights: Array, noise_t: float, along: Array) -> None:
         """Take in the frames of a body; ``along`` is that of `open_directions`."""
         velocity, along = velocity_of(linear.part), np.where(self.tied, along, 0.0)
-        count, sensors = weights.shape
+        (count, sensors), modes = weights.shape, linear.rows[..., : self.count]
         stretches = max(STRETCHES, len(frame_blocks(count, sensors, SYSTEM_ROWS)))
         edges = np.unique(np.linspace(0, count, stretches + 1).astype(int)).tolist()
-        held: list[Array] = []
-        for block in (slice(*pair) for pair in pairwise(edges)):
+        blocks = [slice(*pair) for pair in pairwise(edges)]
+
+        def sums(block: slice) -> tuple[Array, ...]:
             part, root = linear.part.frames(block), np.sqrt(weights[block]) / noise_t
             columns = self.parameters.derivatives(
                 part, linear.flux[block], linear.by_place[block], linear.by_axis[block],
                 velocity[block],
             )  # fmt: skip
-            right = np.concatenate(
-                [as_real(columns), linear.residual[block][:, :, None, :]], axis=2
-            )
-            right = right * root[:, :, None, None]
-            rows = linear.rows[block][..., : self.count] * root[:, :, None]
+            right = np.empty((*root.shape, self.parts, columns.shape[2] + 1))
+            right[..., :-1] = as_real(columns).transpose(0, 1, 3, 2)
+            right[..., -1] = linear.residual[block]
+            right *= root[:, :, None, None]
+            rows = modes[block] * root[:, :, None]
+            flat, flat_right = rows.reshape(-1, self.count), right.reshape(-1, right.shape[3])
+            mixed = (flat.T @ right.reshape(len(flat), -1)).reshape(self.count, self.parts, -1)
             taken = self._taken(along[block], rows, right)
-            held.append(taken)
-            if sum(map(len, held)) >= POSE_ROWS:
-                subtract_gram(self.open, np.concatenate(held))
-                held = []
-            flat_rows = rows.reshape(-1, self.count)
-            self.gram += flat_rows.T @ flat_rows
-            mixed = np.tensordot(right, rows, axes=([0, 1], [0, 1])).transpose(1, 2, 0)
-            self.mixed += mixed
-            columns_flat = right.transpose(2, 0, 1, 3).reshape(right.shape[2], -1)
-            inner = columns_flat @ columns_flat.T
-            self.own += inner
-            self.scores.append(self._score(mixed[:, :, -1], inner[:-1, -1], taken))
-        if held:
-            subtract_gram(self.open, np.concatenate(held))
+            return taken, flat.T @ flat, mixed.transpose(1, 0, 2), flat_right.T @ flat_right
+
+        several = max(1, -(-len(blocks) * POSE_ROWS // max(6 * count, 1)))
+        for few in slices(len(blocks), several):
+            found = in_order(sums, blocks[few])
+            subtract_gram(self.open, np.concatenate([taken for taken, *_ in found]))
+            for taken, gram, mixed, own in found:
+                self.gram += gram
+                self.mixed += mixed
+                self.own += own
+                self.scores.append(self._score(mixed[:, :, -1], own[:-1, -1], taken))
 
     def _taken(self, along: Array, rows: Array, right: Array) -> Array:
         """Return what open poses take, six rows a frame: of tied parts, parameters, residual."""
         count, _, sensors, parts = along.shape
         tied = np.ascontiguousarray(along[..., self.tied].transpose(0, 1, 3, 2))
         by_field = tied.reshape(count, -1, sensors) @ rows
-        by_rest = along.reshape(count, 6, -1) @ right.transpose(0, 1, 3, 2).reshape(
-            count, sensors * parts, -1
-        )
+        by_rest = along.reshape(count, 6, -1) @ right.reshape(count, sensors * parts, -1)
         taken = np.concatenate([by_field.reshape(count, 6, -1), by_rest], axis=2)
         return np.asarray(taken.reshape(6 * count, -1))
 

@@ -1,17 +1,16 @@
-"""Solves least squares: many rows by one small kept factor, large normal matrices in strips.
+"""Solves least squares: many rows by one small kept factor, large normal matrices.
 
 `TriangularFactor` and `GramFactor` keep a problem of any number of rows as one small matrix, whose
 `Spectrum` gives the solution for every damping. `NormalFactor` factors the matrix of a joint
-system in strips that threads share. The strips are the same for any number of threads, and so are
-the results, bit by bit, which they are not when the threads of a BLAS divide one product among
-them. The factor is Cholesky's, worked out by blocks (Golub and Van Loan, Matrix Computations,
-section 4.2.9).
+system, which `subtract_gram` sums in strips that threads share. The strips are the same for any
+number of threads, and so are the results, bit by bit.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
+from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri
 
 from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.parallel import in_order, slices
@@ -143,55 +142,20 @@ def subtract_gram(out: Array, rows: Array) -> None:
 
 
 class NormalFactor:
-    """Holds the upper factor U of a positive definite matrix ``U^T U``.
+    """Holds Cholesky's factor of a positive definite matrix.
 
     ``matrix`` (N, N): of which only the upper triangle is read; the factor takes its place.
     Raises `numpy.linalg.LinAlgError` when it is not positive definite.
     """
 
     def __init__(self, matrix: Array) -> None:
-        self._factor = left = matrix
-        self._strips = slices(len(matrix), STRIP)
-        self._inverses: list[Array] = []
-        for at, own in enumerate(self._strips):
-
-            def reduce(other: slice, own: slice = own) -> None:
-                left[own, other] -= left[: own.start, own].T @ left[: own.start, other]
-
-            in_order(reduce, self._strips[at:])
-            corner = left[own, own]
-            corner[:] = np.linalg.cholesky(corner.T).T  # which reads the lower triangle only
-            inverse = np.asarray(scipy.linalg.solve_triangular(corner, np.eye(len(corner)))).T
-
-            def divide(other: slice, own: slice = own, inverse: Array = inverse) -> None:
-                left[own, other] = inverse @ left[own, other]
-
-            in_order(divide, self._strips[at + 1 :])
-            self._inverses.append(inverse)
+        # LAPACK has columns for rows.
+        self._factor = cho_factor(matrix.T, lower=True, overwrite_a=True, check_finite=False)
 
     def solve(self, right: Array) -> Array:
         """Return the solution X (N, Q) of ``matrix X = right``."""
-        factor, out = self._factor, right.copy()
-        pairs = list(zip(self._strips, self._inverses, strict=True))
-        for own, inverse in pairs:
-            out[own] = inverse @ (out[own] - factor[: own.start, own].T @ out[: own.start])
-        for own, inverse in reversed(pairs):
-            out[own] = inverse.T @ (out[own] - factor[own, own.stop :] @ out[own.stop :])
-        return out
+        return np.asarray(cho_solve(self._factor, right, check_finite=False))
 
     def inverse_diagonal(self) -> Array:
-        """Return the diagonal of the matrix's inverse, shape (N,)."""
-        factor, strips, inverses = self._factor, self._strips, self._inverses
-
-        def work(first: int) -> Array:
-            """Sums of squares of the columns of the factor's inverse, transposed, in a strip."""
-            begin = strips[first].start
-            columns = np.zeros((len(factor) - begin, len(inverses[first])))
-            columns[: len(inverses[first])] = inverses[first]
-            for own, inverse in zip(strips[first + 1 :], inverses[first + 1 :], strict=True):
-                above = columns[: own.start - begin]
-                product = factor[begin : own.start, own].T @ above
-                columns[own.start - begin : own.stop - begin] = -inverse @ product
-            return np.asarray(np.einsum('ij,ij->j', columns, columns))
-
-        return np.concatenate(in_order(work, range(len(strips))))
+        """Return the diagonal of the matrix's inverse, shape (N,); it takes the factor's place."""
+        return np.diag(dpotri(self._factor[0], lower=1, overwrite_c=1)[0])

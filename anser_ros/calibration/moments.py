@@ -47,7 +47,7 @@ class PoseTerms:
     # (F, S, 2K): measured minus modelled flux, T; real and imaginary parts by turns
     residual: Array
     # (F, S, 2K, 6): derivative of the modelled flux by a shift (T/m) and a rotation (T/rad) of the
-    # body, both in fg, the rotation about the body's origin
+    # body, both in fg, the rotation about the body's origin; in memory (F, 6, S, 2K)
     slope: Array
 
 
@@ -74,14 +74,14 @@ def pose_slopes(
     """
     place, turn = least_squares.as_real(by_place), least_squares.as_real(by_axis)
     arms = points - position[:, None, :]
-    out = np.empty((*place.shape[:2], place.shape[3], 6))
+    out = np.empty((len(place), 6, place.shape[1], place.shape[3]))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        out[..., i] = place[:, :, i]
+        out[:, i] = place[:, :, i]
         # The cross products, in a small part of the time of `numpy.cross`.
         moved_by = arms[..., j, None] * place[:, :, k] - arms[..., k, None] * place[:, :, j]
         turned_by = axes[..., j, None] * turn[:, :, k] - axes[..., k, None] * turn[:, :, j]
-        out[..., 3 + i] = moved_by + turned_by
-    return out
+        np.add(moved_by, turned_by, out=out[:, 3 + i])
+    return out.transpose(0, 2, 3, 1)
 
 
 def most_probable_step(
@@ -133,15 +133,14 @@ class PoseWhitener:
     """
 
     def __init__(self, slope: Array, weights: Array, noise_t: float, precision: Array) -> None:
-        frames, _, parts, _ = slope.shape
         self.noise_t, self.stated = noise_t, precision
-        self.root = np.repeat(np.sqrt(weights), parts, axis=1)
-        self.slope = slope.reshape(frames, -1, 6) * (self.root / noise_t)[:, :, None]
-        normal = self.slope.transpose(0, 2, 1) @ self.slope
+        self.root = np.repeat(np.sqrt(weights), slope.shape[2], axis=1)
+        by_pose = slope.transpose(0, 3, 1, 2).reshape(len(slope), 6, -1)
+        self.slope = by_pose * (self.root / noise_t)[:, None]  # (F, 6, 2KS)
+        normal = self.slope @ self.slope.transpose(0, 2, 1)
         self.precision = normal + precision[..., None] * np.eye(6)
         self.inverse = np.linalg.inv(self.precision)
         self.share = np.asarray(self.inverse @ normal)
-        self.readings = self.root.astype(bool).sum(axis=1)
 
     @property
     def freedom(self) -> float:
@@ -156,7 +155,7 @@ class PoseWhitener:
     def _projected(self, residual: Array) -> tuple[Array, Array]:
         """Return residuals in units of the noise (F, 2KS) and their products with J (F, 6)."""
         white = residual.reshape(self.root.shape) * self.root / self.noise_t
-        return white, np.einsum('fri,fr->fi', self.slope, white)
+        return white, (self.slope @ white[:, :, None])[:, :, 0]
 
     def chi_square(self, residual: Array) -> Array:
         """Return each frame's ``r^T C^-1 r``, shape (F,), of residuals (F, S, 2K) in T."""
@@ -168,7 +167,7 @@ class PoseWhitener:
         """Return the part (F, S, 2K) of residuals that no pose explains, ``sigma^2 C^-1 r``."""
         white, along = self._projected(residual)
         step = np.einsum('fij,fj->fi', self.inverse, along)
-        left = white - np.einsum('fri,fi->fr', self.slope, step)
+        left = white - (step[:, None] @ self.slope)[:, 0]
         return np.asarray((left * self.noise_t).reshape(residual.shape))
 
     def excess_power(self, residual: Array, flux_noise_t: float | None = None) -> Array:
@@ -187,8 +186,9 @@ class PoseWhitener:
         power = (left**2).sum(axis=1)
         taken = np.trace(self.share, axis1=1, axis2=2)
         square = np.einsum('fij,fji->f', self.share, self.share)
-        first = self.readings - taken
-        second = np.maximum(self.readings - 2.0 * taken + square, 1.0)
+        readings = np.count_nonzero(self.root, axis=1)
+        first = readings - taken
+        second = np.maximum(readings - 2.0 * taken + square, 1.0)
         noise = self.noise_t if flux_noise_t is None else flux_noise_t
         jitter = self.noise_t**2 * (first - second)
         return np.asarray((power - noise**2 * second - jitter) / second)

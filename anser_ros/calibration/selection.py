@@ -170,11 +170,10 @@ class LayoutScorer:
         mask = body.folds == fold
         rows = np.repeat(mask, len(body.corrected.sensors))
         target = as_real(body.corrected.flux)[mask] + body.back[mask]
-        held_out = matrix[rows]
-        sums = [
-            body.whiteners[fold].chi_square(target - (held_out @ m).reshape(target.shape)).sum()
-            for m in moments
-        ]
+        # Those of all dampings beside each other: one product is faster than many narrow ones.
+        made = np.split(matrix[rows] @ np.concatenate(moments, axis=1), len(moments), axis=1)
+        white = body.whiteners[fold]
+        sums = [white.chi_square(target - m.reshape(target.shape)).sum() for m in made]
         return np.array(sums), float(body.weights[mask].sum()) * target.shape[2]
 
 

@@ -5,9 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
 from rich.table import Table
 
 from anser_ros.arrays import Array
@@ -17,7 +15,6 @@ from anser_ros.calibration.result import Calibration, to_document
 from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.cli import output
 from anser_ros.cli.diagnosis_words import flux_unit
-from anser_ros.cli.page import legend_under
 from anser_ros.effects.effect import effect_named
 from anser_ros.errors import FitError
 from anser_ros.field.model import EffectRecord
@@ -188,7 +185,7 @@ def population_table(records: Sequence[EffectRecord]) -> tuple[list[str], list[l
     return head, [list(row) for row in zip(*columns, strict=True)]
 
 
-def population_figure(records: Sequence[EffectRecord]) -> Figure | None:
+def population_figure(records: Sequence[EffectRecord]) -> Any:
     """Draw each channel's values with one sigma, and the population's width behind them.
 
     Returns None where no record is a population.
@@ -196,6 +193,10 @@ def population_figure(records: Sequence[EffectRecord]) -> Figure | None:
     found = populations(records)
     if not found:
         return None
+    from matplotlib import pyplot as plt  # late: it takes as long as all others
+
+    from anser_ros.cli.page import legend_under
+
     width = 4 * len(found)
     figure, panels = plt.subplots(
         1, len(found), figsize=(width, 3.5), squeeze=False, layout='constrained'
@@ -233,13 +234,17 @@ def _shown(record: EffectRecord) -> tuple[tuple[str, ...], str, Array, Array]:
     return ('rms',), unit, mean[0], mean[1]
 
 
-def choice_figure(calibration: Calibration) -> Figure | None:
+def choice_figure(calibration: Calibration) -> Any:
     """Draw held-out errors by the number of dipoles, and by damping for the six best layouts.
 
     Returns None where no layouts were compared.
     """
     if not calibration.candidates:
         return None
+    from matplotlib import pyplot as plt
+
+    from anser_ros.cli.page import legend_under
+
     picked = next(one for one in calibration.candidates if one.layout == calibration.layout)
     factor, unit = flux_unit(picked.score)
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 5.4), layout='constrained')

@@ -21,7 +21,7 @@ from typing import Any, NoReturn
 from anser_ros import extensions
 from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
 from anser_ros.errors import AnserError, OneLineParser
-from anser_ros.parallel import ONE_THREAD, cores, shared_among
+from anser_ros.parallel import ONE_THREAD, cores, prepare_process, shared_among
 
 # Exit codes, as docs/interfaces.md has them.
 EXIT_OK = 0  # done
@@ -104,6 +104,7 @@ def run_verb(name: str, arguments: Sequence[str]) -> int:
         parser = OneLineParser(prog=f'anser {name}', description=words)
         module.add_arguments(parser)
         args = parser.parse_args(arguments)
+        prepare_process()
         with shared_among(cores()):
             return int(module.run(args)) if hasattr(module, 'run') else _show(name, module, args)
 

@@ -102,9 +102,9 @@ def _demo_model() -> FieldModel:
     return load_model(config_path('demo_model.yaml'))
 
 
-STEPS = dict(zip(PARTS, ((_track,), (_solve_body, _refit, _watch_samples)), strict=True))
+STEPS = dict(zip(PARTS, ((_track,), (_watch_samples, _solve_body, _refit)), strict=True))
 """What each of the processes does, both for as long. What one has compiled the other one loads: so
-bodies, which tracking comes to last, are the second one's first."""
+the second one begins with what the first does not need, and with what it comes to last."""
 
 
 if __name__ == '__main__':

@@ -6,9 +6,9 @@ offline. Effects on the field are in the model's dipoles already, and effects th
 corrected are skipped.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,8 +22,9 @@ from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
 
-KEPT = 6
-"""Sets of sensors whose slopes are kept, some megabytes each."""
+Kept = TypeVar('Kept')
+KEPT = 12
+"""Views, and sets of sensors with their slopes, that are kept, some megabytes each."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +34,8 @@ class Fields:
     model: Dipoles  # Good where tool sensors were calibrated
     illumination: Dipoles  # Good beside and below the board: what metal and reference sensors see
     omega: Array  # (K,), rad/s
-    # what `slopes` has found last, by what it was asked for; other fields begin with nothing
-    kept: dict[tuple[bool, bytes], tuple[ComplexArray, ...]] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
+    # what was found last, by what was asked for; other fields begin with nothing
+    kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def slopes(
         self, points: Array, axes: Array, lengths: Array, far: bool = False
@@ -46,12 +45,16 @@ class Fields:
         With their derivatives (P, 3, K) by place and axis. A fit asks for the same sensors again
         and again: the last answers are kept, and must not be changed.
         """
+        dipoles = self.illumination if far else self.model
+        sites = dipoles.positions, dipoles.directions, dipoles.moments
         key = far, b''.join(array.tobytes() for array in (points, axes, lengths))
-        found = self.kept.get(key)
+        return self.once(key, lambda: flux_jacobian(points, axes, lengths, *sites))
+
+    def once(self, key: Hashable, make: Callable[[], Kept]) -> Kept:
+        """Return what was made for a key, or make it; what is kept must not be changed."""
+        found: Kept | None = self.kept.get(key)
         if found is None:
-            dipoles = self.illumination if far else self.model
-            sites = dipoles.positions, dipoles.directions, dipoles.moments
-            found = self.kept[key] = flux_jacobian(points, axes, lengths, *sites)
+            found = self.kept[key] = make()
             for oldest in list(self.kept)[:-KEPT]:
                 self.kept.pop(oldest, None)
         return found
@@ -59,6 +62,14 @@ class Fields:
 
 def tool_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View:
     """Predict a tool's fluxes; the caller leaves out frames without a pose."""
+    still = tuple(term for term in terms if not term.effect.moving)
+    key = id(body), *map(id, still)  # kept with its objects, whose addresses no others get then
+    *_, view = fields.once(key, lambda: (body, still, _still_view(body, still, fields)))
+    return _measured(_with_motion(view, terms), terms)
+
+
+def _still_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View:
+    """What a tool would read without emitters' and channels' errors, and where nothing moves."""
     position, rotation, velocity = _poses(body, terms)
     sensors = body.sensors
     for term in terms:
@@ -75,14 +86,13 @@ def tool_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View
     d_position, d_axis = d_position.reshape(*shape, 3, -1), d_axis.reshape(*shape, 3, -1)
     lever = (centres - position[:, None, :])[..., :, None]
     d_turn = np.cross(lever, d_position, axis=2) + np.cross(axes[..., :, None], d_axis, axis=2)
-    view = View(
+    return View(
         time=body.time, sensors=sensors, position=position, rotation=rotation, velocity=velocity,
         centres=centres, axes=axes, linear=flux.reshape(*shape, -1),
         flux=flux.reshape(*shape, -1), d_position=d_position, d_axis=d_axis, d_turn=d_turn,
         dipoles=fields.model.joined(added), illumination=light, omega=fields.omega,
         is_reference=False,
     )  # fmt: skip
-    return _measured(_with_motion(view, terms), terms)
 
 
 def reference_view(

@@ -321,7 +321,8 @@ class MovingMetal(Effect[MovingTerm]):
         moved = in_order(lambda shift: term.flux(view, shift), [*steps, *-steps])
         by_place = (np.stack(moved[:3], axis=-1) - np.stack(moved[3:], axis=-1)) / (2 * STEP)
         rates = term.path.rates(term.course, view.time)
-        out[..., : term.placed] = by_place @ rates[:, None]
+        each = by_place.reshape(len(rates), -1, 3) @ rates
+        out[..., : term.placed] = each.reshape(*by_place.shape[:3], -1)
         return out
 
     def moving_flux(self, term: MovingTerm, view: View) -> ComplexArray:
