@@ -38,10 +38,6 @@ def settings_for(
     )
 
 
-STOOD_FRAMES = 100
-"""Frames, about, that tell which of a model's sessions another stands like, by a median."""
-
-
 @dataclass(frozen=True)
 class PreparedSession:
     """Holds a session and a model that fits it, with what follows from the two.
@@ -120,10 +116,9 @@ def as_it_stood(model: FieldModel, session: Session) -> FieldModel:
     knows no such difference, it stands in between, as it was written.
     """
     every = list(dict.fromkeys(filter(None, (e.parameters.get(SESSION) for e in model.effects))))
-    posed = [tool for tool in map(with_pose, session.tools) if len(tool.time)]
-    if not every or not posed:
+    tools = [tool for tool in map(with_pose, session.tools) if len(tool.time)]
+    if not every or not tools:
         return model
-    tools = [m.frames(np.arange(0, len(m.time), 1 + len(m.time) // STOOD_FRAMES)) for m in posed]
 
     def left(one: FieldModel) -> float:
         how = _correction(one, session), is_recorded(one, session)
