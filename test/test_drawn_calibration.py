@@ -195,6 +195,20 @@ def test_a_pitch_or_a_place_that_is_a_little_wrong_is_said(setup, change, said):
     assert re.search(said, ' '.join(calibrated(wrong).contradictions))
 
 
+def test_an_emitter_that_warms_up_while_a_plate_is_read_is_learnt_beside_the_board(setup):
+    world = World(setup, 5)
+    session = world.grid([0.084])
+    (tool,) = session.tools
+    gain = np.ones((49, 1, 8))
+    gain[:, 0, 3] += 0.03 * (1.0 - np.exp(-tool.time / 60.0))
+    result = calibrated(wrongly(session, flux=tool.flux * gain))
+    assert world.error_m(result.model)[1] < 3e-4
+    rows = [str(row['words']) for row in to_document(result)['emitters']]
+    assert re.search(r'coil3 .*became [12]\.\d % stronger while it was read', ' '.join(rows)), rows
+    assert sum('while' in row for row in rows) == 1
+    assert result.model.provenance['emitter_strengths'].startswith('those at the start')
+
+
 def test_a_tool_moved_by_hand_calibrates_without_a_camera(setup):
     world = World(setup, 6)
     result = calibrated(world.waved(15.0))
