@@ -18,6 +18,7 @@ from anser_ros.integrity import pose_checks
 from anser_ros.integrity.pose_checks import STREAM_GAP_S, Continuity, Place
 from anser_ros.stamps import NANO
 from anser_ros.tracking.body_track import BodyResult
+from anser_ros.tracking.coil_step import UNKNOWNS
 from anser_ros.tracking.coil_track import CoilResult
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
 from anser_ros.tracking.rigid import BodyCoils
@@ -202,9 +203,10 @@ def _add_gain_error(
 ) -> None:
     """Add to some coils' covariances, in ``found``, what a common gain does, see `add_gain`."""
     for row in rows:
-        solution = coils[row].solution
-        if solution is not None and found[row].state == states.OK:
-            add_gain(found[row].covariance, solution.normal, solution.axis, gain)
+        one, solution = found[row], coils[row].solution
+        if solution is not None and one.state == states.OK:
+            misfit = max(one.chi2 - 1.0, 0.0) * (solution.residual.size - UNKNOWNS)
+            add_gain(one.covariance, solution.normal, solution.axis, gain, misfit)
 
 
 def _judged_by_coils(found: Estimates, body: RigidBody, settings: TrackerSettings) -> PoseEstimate:

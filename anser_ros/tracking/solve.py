@@ -234,13 +234,13 @@ LEAST_GAIN = 5e-4
 
 
 @kernel
-def add_gain(covariance, normal, axis, gain):  # type: ignore[no-untyped-def]
+def add_gain(covariance, normal, axis, gain, misfit):  # type: ignore[no-untyped-def]
     """Add to a coil's covariance (6, 6), in place, what a gain with a deviation of ``gain`` does.
 
     A coil alone takes a gain for another distance. With the free axis vector n that the normal
     matrix has, see `coil_covariance`, a gain is a change of n along itself. Where no body tells
     the gain, NaN, it is what the coil's own readings leave of the prior, as in
-    `rigid.BodySolution.gain`.
+    `rigid.BodySolution.gain`, all of their ``misfit`` (chi-square beyond its mean) being its.
     """
     own, pull, moved = coil_covariance(normal, axis, 0.0), np.zeros(6), np.zeros(6)
     known = 0.0
@@ -255,13 +255,10 @@ def add_gain(covariance, normal, axis, gain):  # type: ignore[no-untyped-def]
         for j in range(6):
             moved[i] += own[i, j] * pull[j]
     if math.isnan(gain):
-        before, after = 0.0, 0.0
-        for i in range(3):
-            before, after = before + own[i, i], after + covariance[i, i]
         for i in range(6):
             known -= pull[i] * moved[i]
-        known = max(known, 0.0) / max(after / before, 1.0)
-        gain = math.sqrt(max(1.0 / (known + COMMON_GAIN**-2) - LEAST_GAIN**2, 0.0))
+        known = max(known, 0.0) + COMMON_GAIN**-2
+        gain = math.sqrt(max((1.0 + misfit) / known - LEAST_GAIN**2, 0.0))
     for i in range(6):
         for j in range(6):
             covariance[i, j] += gain * moved[i] * gain * moved[j]
