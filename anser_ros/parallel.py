@@ -26,8 +26,8 @@ TURN_S = 1e-4
 """Longest that a thread waits for the interpreter, s, while others work in Python: about a call of
 numpy. With Python's 5 ms two threads of a diagnosis are no faster than one."""
 KEEP_MEMORY = {-1: 2**31 - 1, -4: 0, -8: 1}
-"""Settings of the GNU C library (mallopt) by which freed memory is kept: bytes at most, arrays
-with pages of their own, arenas. New pages take a tenth of the time."""
+"""The GNU C library's mallopt: freed bytes kept, arrays with pages of their own, arenas. New pages
+take a tenth of the time."""
 _THIS = threading.local()
 
 

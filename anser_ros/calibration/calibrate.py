@@ -38,6 +38,7 @@ from anser_ros.calibration.sensor_fit import SensorFitter
 from anser_ros.calibration.sensor_parameters import SURVEYED_M
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel, OpenArm
+from anser_ros.parallel import in_order
 from anser_ros.settings import Accuracy
 
 Tested = tuple[LayoutCandidate, HeldOut]
@@ -213,7 +214,8 @@ def best_damped(
     if candidate.layout.kind in FREE_KINDS:  # whose poses are as exact in the comparison
         return candidate, held_out
     near = [replace(candidate, damping=damping) for damping in around]
-    other, result = min(((one, tested(one)) for one in near), key=lambda pair: pair[1].score_t)
+    tries = zip(near, in_order(tested, near), strict=True)
+    other, result = min(tries, key=lambda pair: pair[1].score_t)
     while result.score_t < held_out.score_t:
         ahead = 2 * DAMPINGS.index(other.damping) - DAMPINGS.index(candidate.damping)
         candidate, held_out = other, result

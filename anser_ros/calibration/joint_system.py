@@ -103,11 +103,10 @@ class Linear(PoseTerms):
 
 def linearise(part: Measurements, modes: FieldModes, field: Array) -> Linear:
     """Evaluate a field, given by its modes (M, 2K), and all derivatives at a body's poses."""
-    points, axes = part.placed()
     flux, by_place, by_axis = flux_slopes(part, modes.sites, as_complex(modes.vectors @ field))
     return Linear(
         as_real(part.flux) - as_real(flux),
-        pose_slopes(points, axes, part.position, by_place, by_axis),
+        pose_slopes(*part.placed(), part.position, by_place, by_axis),
         part,
         modes,
         flux,

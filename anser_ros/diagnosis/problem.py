@@ -130,7 +130,8 @@ class Whitener:
 
         ``widths``: q of each group; the columns of one that is missing are zero.
         """
-        out, half = np.zeros((*self.weight.shape, sum(widths))), self.weight.shape[1] // 2
+        make = np.zeros if any(group is None for group in groups) else np.empty
+        out, half = make((*self.weight.shape, sum(widths))), self.weight.shape[1] // 2
         ends = np.cumsum(widths).tolist()
 
         def work(mine: slice) -> None:

@@ -311,11 +311,12 @@ class MovingMetal(Effect[MovingTerm]):
     def columns(self, term: MovingTerm, view: View) -> ComplexArray:
         """Return derivatives by the path (differences, chained) and by the amplitudes (exact)."""
         unit = term.unit(view)
-        out = view.columns(term.theta.size)
+        out = np.empty((*view.flux.shape, term.theta.size), dtype=complex)
         ends = term.placed, term.placed + unit.shape[-1]
         out[..., ends[0] : ends[1]] = unit
         np.multiply(unit, 1j, out=out[..., ends[1] :])
         if term.held:
+            out[..., : term.placed] = 0.0
             return out
         steps = STEP * np.eye(3)
         moved = in_order(lambda shift: term.flux(view, shift), [*steps, *-steps])
