@@ -14,7 +14,7 @@ from anser_ros.wire.setup import topic_of
 BAGS = Path(__file__).resolve().parents[1] / 'bags'
 
 
-def compare(bag: Path, model: Path) -> None:
+def compare(bag: Path, model: Path, alike_m: float = 1e-8) -> None:
     """Poses over DDS are those of the offline evaluation, and as good as the reference."""
     session = load_session(bag)
     tool = session.tools[0]
@@ -39,7 +39,7 @@ def compare(bag: Path, model: Path) -> None:
         estimates = offline.sensors[name].estimates
         same = np.array([estimates[frame].position for frame in frames])
         # The nodes' first frames may start before a model's uncertainty has arrived.
-        assert np.median(np.abs(live.position - same)) < 1e-8
+        assert np.median(np.abs(live.position - same)) < alike_m
         assert np.abs(live.position - same).max() < 2e-5
 
 
@@ -48,6 +48,10 @@ def test_our_own_bag(domain, factory_calibration):
 
 
 def test_a_session_that_this_package_did_not_make(domain, shared, effects_model, tmp_path):
-    """Its first ten seconds, in which the tool crosses the whole width of the volume."""
+    """Its first ten seconds, in which the tool crosses the whole width of the volume.
+
+    At the edges the model errs as if an emitter were stronger by a thousandth. What tools learn of
+    that depends on the frame that they begin with.
+    """
     bag = shared / 'sessions' / 'effects' / 's01.mcap'
-    compare(beginning(bag, tmp_path / 'begin.mcap', 10.0), effects_model)
+    compare(beginning(bag, tmp_path / 'begin.mcap', 10.0), effects_model, alike_m=1e-5)

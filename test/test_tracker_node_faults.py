@@ -160,9 +160,9 @@ def test_only_live_frames_too_fast_to_solve_are_skipped(tracker, monkeypatch, li
     node, whole, pause_s = tracker.node, Tracker.update, [0.2]
     arrived, worked = Backlog.arrived, Backlog.worked
 
-    def slow(self, *arguments):
+    def slow(self, *arguments, **options):
         time.sleep(pause_s.pop() if pause_s else work_s)
-        return whole(self, *arguments)
+        return whole(self, *arguments, **options)
 
     monkeypatch.setattr(Tracker, 'update', slow)
     # How often frames come and what one costs is what the test says, however busy the machine is.

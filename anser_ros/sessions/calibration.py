@@ -7,6 +7,7 @@ determines that part (`diagnosis.departure`), which is subtracted before the fie
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,6 +40,7 @@ from anser_ros.sessions.drawn_calibration import fit_to_drawing, is_for_drawing
 from anser_ros.sessions.nominal_board import NominalBoard, board_of
 from anser_ros.sessions.session import Session, shifted
 from anser_ros.sessions.starting_model import made_for
+from anser_ros.settings import Accuracy
 from anser_ros.wire.setup import Setup
 
 MOTION_MARGIN_S = 1.0
@@ -53,6 +55,9 @@ MOST_UNEXPLAINED = 0.05
 """Share of the readings that a calibration leaves at most: good ones leave a thousandth, those of
 a layout that is too coarse a hundredth, wrong signs or poses, or a source moved by 5 mm, a tenth
 and more."""
+SIGMAS = 3.0 * math.sqrt(2.0)
+"""Stated errors of poses that a contradiction between parts of a scan has to exceed: both have
+theirs."""
 UNCERTAINTY_FRAMES = 60
 """Frames of a tool, about, in which the uncertainty of the metal at rest is worked out."""
 
@@ -291,7 +296,7 @@ def _fit_as_scan(
         same = replace(options, layout=calibration.layout)
         calibration = fit_scan(bare, names, generator, same, progress)
     if options.layout is None:
-        check_explained(calibration)
+        check_explained(calibration, setup.accuracy.optical_position_m)
     scan = calibration.scan
     scan = replace(scan, reported_effects=(*scan.reported_effects, *drifts))
     model = at_start(calibration.model) if drifts else calibration.model
@@ -306,12 +311,22 @@ def _with_faults(scan: Scan, faults: Sequence[Term]) -> Scan:
     return replace(scan, corrections=(*tables, *scan.corrections, *signs))
 
 
-def check_explained(calibration: Calibration) -> None:
+def check_explained(
+    calibration: Calibration, pose_error_m: float = Accuracy.optical_position_m
+) -> None:
     """Raise `FitError` where a model leaves so much of the readings that it is none: of most of
-    them, or where parts of the scan are predicted by the others.
+    them, or where parts of the scan are predicted by the others, by more than an error of the
+    poses as is stated, along each axis, makes of them.
     """
-    left = calibration.residuals
-    share = max(left.unexplained, rms(calibration.held_out.error) / left.read_t)
+    left, by_poses = calibration.residuals, 0.0
+    for one in calibration.scan.measurements:
+        points, axes = one.placed()
+        here = calibration.model.flux(points, axes)
+        for way in pose_error_m * np.eye(3):
+            change = rms(calibration.model.flux(points + way, axes) - here) / rms(here)
+            by_poses = max(by_poses, change)
+    apart = rms(calibration.held_out.error) / left.read_t
+    share = max(left.unexplained, apart if apart > SIGMAS * by_poses else 0.0)
     if share > MOST_UNEXPLAINED:
         raise FitError(
             f'no field explains the scan: {100 * share:.0f} % of the signal is left. Are axes, '

@@ -32,9 +32,10 @@ errors do. Metal leaves a hundred times as much on nine coils."""
 AGREEING, CONTRADICTING = 3, 10
 """Frames in a row that strengths have to explain before they are used, and that they do not before
 they are learnt anew: half a second, in which metal that moves changes, and two seconds."""
-LEAST, CERTAIN = 2e-4, 4.0
-"""Change of a strength that moves a pose by a hundredth of a millimetre, and standard deviations,
-from which on it is one: noise passes them once in an hour, to no harm."""
+LEAST, CERTAIN = 1e-3, 4.0
+"""Change of a strength, and standard deviations of it, from which on it is one. Calibrations leave
+errors of half as much, which are no change: learnt, they made poses no better, and unlike by the
+frame that a tracker began with. A smaller change moves coils by 0.003 mm (simulated)."""
 KNOWN = 3e-3
 """Standard deviation of a strength up to which it is used: from 0.1 mm of a pose on, metal passes
 for strengths that a single coil hardly knows."""
