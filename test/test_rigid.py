@@ -28,7 +28,7 @@ FIELD = RealField.of(MODEL.positions, MODEL.directions, MODEL.moments)
 WIDTH = FIELD.moments.shape[1]
 TOOL = triaxial_tool()
 COILS = BodyCoils(TOOL.position, TOOL.axis, TOOL.length)
-WEIGHTS = np.full((9, WIDTH), 1 / NOISE_T)
+WEIGHTS = np.full(WIDTH, 1 / NOISE_T)
 NOTHING = common_factor(np.zeros((9, 0, WIDTH)), WEIGHTS)
 LOW, HIGH = (corner + sign * 0.03 for corner, sign in zip(TrackedVolume().grown(0.03), (-1, 1),
                                                            strict=True))  # fmt: skip
@@ -38,8 +38,8 @@ def real(flux):
     return np.ascontiguousarray(flux).view(np.float64)
 
 
-def solve(flux, position, rotation, common=NOTHING, coils=COILS, weights=WEIGHTS):
-    return solve_body(FIELD, coils, real(flux), weights, common, position, rotation, LOW, HIGH)
+def solve(flux, position, rotation, common=NOTHING, coils=COILS):
+    return solve_body(FIELD, coils, real(flux), WEIGHTS, common, position, rotation, LOW, HIGH)
 
 
 def nearby(rng, position, rotation, move=0.01, turn=0.2):

@@ -160,7 +160,7 @@ class BodyFrame(SolveFrame):
         if strengths.size:
             own = strength_errors(self.flux[used], strengths)
             shared = np.concatenate([shared, own], axis=1)
-        return rigid.common_factor(shared, np.tile(self.inverse_sigma, (len(used), 1)))
+        return rigid.common_factor(shared, self.inverse_sigma)
 
     def nearer(self, start: Start, used: Integers) -> Start:
         """Return a start moved to where the coils' own good poses agree best."""
@@ -180,12 +180,12 @@ class BodyFrame(SolveFrame):
 def solve_with(frame: BodyFrame, used: Integers, start: Start) -> BodyFit:
     """Return the fit of some of a body's coils from a start near it."""
     part, context = frame.coils.subset(used), frame.context
-    weights = np.tile(frame.inverse_sigma, (len(used), 1))
+    flux = np.ascontiguousarray(frame.flux[used])
     solution = rigid.solve_body(
-        context.field, part, np.ascontiguousarray(frame.flux[used]), weights,
-        frame.common(used, start), *start, context.low - part.reach, context.high + part.reach,
+        context.field, part, flux, frame.inverse_sigma, frame.common(used, start), *start,
+        context.low - part.reach, context.high + part.reach,
     )  # fmt: skip
-    return BodyFit(solution, used, max(weights.size - UNKNOWNS, 1))
+    return BodyFit(solution, used, max(flux.size - UNKNOWNS, 1))
 
 
 def _without_disagreeing(fit: BodyFit, frame: BodyFrame, gate: float) -> BodyFit:

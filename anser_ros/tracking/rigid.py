@@ -38,8 +38,8 @@ def _look(  # type: ignore[no-untyped-def]
     """Fill what `descend_body` keeps of a pose, beginning with position and rotation.
 
     It is the residual (S, 2K), the whitened residual (row 0) and whitened derivatives by
-    translation and turn, both in fg (7, S 2K), and the normal equations (6, 6) and (6,). Returns
-    chi-square. ``basis`` (S, 7, N) is written over.
+    translation and turn, both in fg, the first seven of (8, S 2K), and the normal equations (6, 6)
+    and (6,). Returns chi-square. ``basis`` (S, 7, N) is written over.
     """
     position, rotation, residual, white, information, gradient = pose
     coils, width = flux.shape
@@ -53,7 +53,7 @@ def _look(  # type: ignore[no-untyped-def]
     for s in range(coils):
         m = model[7 * s : 7 * s + 7]
         for k in range(width):
-            w, column = inverse_sigma[s, k], s * width + k
+            w, column = inverse_sigma[k], s * width + k
             residual[s, k] = flux[s, k] - m[0, k]
             white[0, column] = w * residual[s, k]
             for i in range(3):
@@ -116,19 +116,23 @@ def descend_body(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Find the least chi-square near a pose, whose arrays are written over.
 
-    Returns chi-square, whether it converged; position and rotation; residual,
-    whitened residual with derivatives, and information as `_look` fills them at its last pose.
+    Returns chi-square, whether it converged; position and rotation; residual; whitened residual,
+    derivatives and flux (8, S 2K); and information, as `_look` fills them at its last pose.
     """
     basis, size = np.empty((flux.shape[0], 7, dipoles.shape[1])), flux.size
     step, factor = np.empty(6), np.empty((6, 6))
     pose = (
-        np.empty(3), np.empty((3, 3)), np.empty(flux.shape), np.empty((7, size)),
+        np.empty(3), np.empty((3, 3)), np.empty(flux.shape), np.empty((8, size)),
         np.empty((6, 6)), np.empty(6),
     )  # fmt: skip
     trial = (
-        position, rotation, np.empty(flux.shape), np.empty((7, size)), np.empty((6, 6)),
+        position, rotation, np.empty(flux.shape), np.empty((8, size)), np.empty((6, 6)),
         np.empty(6),
     )  # fmt: skip
+    for s in range(flux.shape[0]):
+        for k in range(flux.shape[1]):
+            white = inverse_sigma[k] * flux[s, k]
+            pose[3][7, s * flux.shape[1] + k] = trial[3][7, s * flux.shape[1] + k] = white
     chi2, promised, used, damping, converged = 0.0, 0.0, 0, FIRST_DAMPING, False
     while True:
         trial_chi2 = _look(
@@ -299,7 +303,7 @@ def _common(modes, inverse_sigma, out):  # type: ignore[no-untyped-def]
     for s in range(coils):
         for r in range(count):
             for k in range(width):
-                out[r, s * width + k] = modes[s, r, k] * inverse_sigma[s, k]
+                out[r, s * width + k] = modes[s, r, k] * inverse_sigma[k]
     factor = np.dot(out, out.T)
     for i in range(count):
         for j in range(i + 1):
@@ -321,9 +325,9 @@ def common_factor(modes: Array, inverse_sigma: Array) -> Array:
     """Return E (R, S 2K) with ``(I + D^T D)^-1 = I - E^T E`` for whitened modes D.
 
     ``modes`` (S, R, 2K) are flux errors of one standard deviation each that several coils share,
-    T; ``inverse_sigma`` (S, 2K) is in 1/T. Raises `TrackingError` when the modes are not finite.
+    T; ``inverse_sigma`` (2K,) is in 1/T. Raises `TrackingError` when the modes are not finite.
     """
-    common = np.empty((modes.shape[1], inverse_sigma.size))
+    common = np.empty((modes.shape[1], len(modes) * inverse_sigma.size))
     if not _common(modes, inverse_sigma, common):
         raise TrackingError('the model covariance must be finite')
     return common
@@ -342,13 +346,13 @@ def solve_body(
 ) -> BodySolution:
     """Fit a rigid tool's pose from a start near it.
 
-    ``flux`` (S, 2K) in T has real and imaginary part by turns, ``inverse_sigma`` (S, 2K) is in
+    ``flux`` (S, 2K) in T has real and imaginary part by turns, ``inverse_sigma`` (2K,) is in
     1/T; ``common`` is from `common_factor`, without a row for a model without uncertainty. The
     body's origin does not leave the box from ``low`` to ``high``, m. Raises `TrackingError` when
     shapes don't fit.
     """
     count, width = len(coils.offsets), field.moments.shape[1]
-    if flux.shape != (count, width) or inverse_sigma.shape != flux.shape:
+    if flux.shape != (count, width) or inverse_sigma.shape != (width,):
         raise TrackingError(f'{count} coils and {width} components, got flux {flux.shape}')
 
     r, turn = np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64)
@@ -357,8 +361,7 @@ def solve_body(
         field.columns, field.moments, low, high, MAX_EVALUATIONS,
     )  # fmt: skip
     coil_chi2 = (white[0].reshape(count, width) ** 2).sum(axis=1)
-    rows = np.concatenate([white, (inverse_sigma * flux).reshape(1, -1)])
-    return BodySolution(r, turn, chi2, information, residual, coil_chi2, converged, rows, common)
+    return BodySolution(r, turn, chi2, information, residual, coil_chi2, converged, white, common)
 
 
 def start_from_coils(

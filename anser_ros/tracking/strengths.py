@@ -184,7 +184,7 @@ class EmitterStrengths:
         """
         solution, used = fit.solution, fit.used
         flux, start = frame.flux[used], (solution.position, solution.rotation)
-        weights, shared = np.tile(frame.inverse_sigma, (len(used), 1)), frame.shared(used, start)
+        weights, shared = frame.inverse_sigma, frame.shared(used, start)
         if not fit.good(USUAL_GATE):
             known = self._covariance[: self._width, : self._width]
             own = strength_errors(flux, np.asarray(np.linalg.cholesky(known), np.float64))
@@ -199,7 +199,7 @@ class EmitterStrengths:
             away -= self.used.view(np.float64)
         unknowns = (body_track if len(used) > 1 else coil_step).UNKNOWNS
         ratio: float = learn_strengths(
-            solution.rows, flux, frame.inverse_sigma, rigid.common_factor(shared, weights), away,
-            weights.size - unknowns, MOST_LEFT, self._mean, self._covariance,
+            solution.rows, flux, weights, rigid.common_factor(shared, weights), away,
+            flux.size - unknowns, MOST_LEFT, self._mean, self._covariance,
         )  # fmt: skip
         return ratio <= MOST_LEFT

@@ -442,8 +442,8 @@ def warm_up_bodies(model: FieldModel) -> None:
     context = build_context(model, TrackerSettings())
     coils = rigid.BodyCoils(np.zeros((3, 3)), np.eye(3), np.zeros(3))
     flux = model.flux(coils.offsets + [0.0, 0.0, 0.15], coils.axes, coils.lengths).view(np.float64)
-    weights = np.tile(1.0 / context.sigma, (3, 1))
-    common = rigid.common_factor(np.zeros((3, 0, context.sigma.size)), weights)
+    weights = 1.0 / context.sigma
+    common = rigid.common_factor(np.zeros((3, 0, weights.size)), weights)
     normals, took_part = np.tile(np.eye(6), (3, 1, 1)), np.ones(3, dtype=bool)
     for start in rigid.start_from_grid(context.grid, context.field, coils, flux):
         found = rigid.solve_body(

@@ -161,7 +161,7 @@ class _SourceFrame(SolveFrame):
         """Descend to the pose near a start."""
         part, context, used = self.coils.subset(self.used), self.context, self.used
         flux = np.ascontiguousarray(self.flux[np.ix_(used, self.live)])
-        weights = np.tile(1.0 / context.sigma[self.live], (len(used), 1))
+        weights = 1.0 / context.sigma[self.live]
         common = common_factor(part.gain_errors(flux), weights)
         low, high = context.low - part.reach, context.high + part.reach
         return solve_body(self.field, part, flux, weights, common, *start, low, high)
