@@ -7,7 +7,6 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from anser_ros.arrays import Array, ComplexArray, Integers, pairs_of
 from anser_ros.effects.base import Apparatus, View
@@ -149,6 +148,8 @@ def spline_weights(nodes: Array, at: Array, ends: str) -> Array:
 @lru_cache(maxsize=KEPT_SPLINES)
 def _spline_weights(nodes: bytes, at: bytes, ends: str) -> Array:
     grid = np.frombuffer(nodes)
+    from scipy.interpolate import CubicSpline  # loads slowly, and no live node needs it
+
     weights = np.asarray(CubicSpline(grid, np.eye(grid.size), bc_type=ends)(np.frombuffer(at)))
     weights.flags.writeable = False
     return weights

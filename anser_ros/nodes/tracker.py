@@ -40,8 +40,7 @@ from anser_ros.nodes.streams import one_source
 from anser_ros.nodes.streams.clouds import GivenModel, read_frame, readings_of
 from anser_ros.nodes.tracker_models import ModelIntake, ModelReader
 from anser_ros.pose_states import OK, TWO_SOURCES, Withheld
-from anser_ros.sessions.prepared import settings_for
-from anser_ros.sessions.session import sensor_table
+from anser_ros.sessions.session import sensor_table, settings_for
 from anser_ros.sessions.starting_model import check_emitters, model_of
 from anser_ros.stamps import SECOND_NS, is_live
 from anser_ros.tracking.estimate import NO_GATE, USUAL_GATE, PoseEstimate, Tip, TrackerSettings

@@ -16,26 +16,8 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.baseline import Baseline, clean_flux
 from anser_ros.sessions.nominal_board import NominalBoard, tracked_volume
 from anser_ros.sessions.plausibility import check_unit
-from anser_ros.sessions.session import Session, measured_noise, stamp_sigma, tracking_noise
+from anser_ros.sessions.session import Session, measured_noise
 from anser_ros.sessions.starting_model import check_fits, is_recorded
-from anser_ros.tracking.estimate import TrackerSettings
-from anser_ros.wire.setup import Setup
-
-
-def settings_for(
-    setup: Setup, settings: TrackerSettings, model: FieldModel | None = None
-) -> TrackerSettings:
-    """Return settings with what the setup states or measured, and its volume if they have none.
-
-    The noise is that which the model was calibrated with, unless it was measured or said since.
-    """
-    return replace(
-        settings,
-        flux_noise_t=tracking_noise(setup, 0.0 if model is None else model.noise_t),
-        stamp_sigma_s=stamp_sigma(setup),
-        tools=setup.refit.tools,
-        volume=settings.volume or tracked_volume(setup),
-    )
 
 
 @dataclass(frozen=True)

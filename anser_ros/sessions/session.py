@@ -10,11 +10,14 @@ import numpy as np
 from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import GOOD, reading_codes
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable, Windings
+from anser_ros.sessions.nominal_board import tracked_volume
 from anser_ros.sessions.plausibility import plausible_tools
 from anser_ros.stamps import NANO
+from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.wire.points import STALE
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorRows, SensorSpec, Setup
@@ -96,6 +99,22 @@ def stamp_sigma(setup: Setup) -> float:
     """Return the error of the fluxes' stamps, s: stated, or else measured, or else the default."""
     measured = _measured(setup, 'stamp_sigma_s')
     return measured if 0.0 <= measured <= MOST_STAMP_SIGMA_S else setup.accuracy.stamp_sigma_s
+
+
+def settings_for(
+    setup: Setup, settings: TrackerSettings, model: FieldModel | None = None
+) -> TrackerSettings:
+    """Return settings with what the setup states or measured, and its volume if they have none.
+
+    The noise is that which the model was calibrated with, unless it was measured or said since.
+    """
+    return replace(
+        settings,
+        flux_noise_t=tracking_noise(setup, 0.0 if model is None else model.noise_t),
+        stamp_sigma_s=stamp_sigma(setup),
+        tools=setup.refit.tools,
+        volume=settings.volume or tracked_volume(setup),
+    )
 
 
 def pose_track(stream: PoseStream, start_ns: int) -> PoseTrack:

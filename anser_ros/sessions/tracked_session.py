@@ -24,8 +24,8 @@ from anser_ros.physics.rotations import axis_angles, rotation_angles
 from anser_ros.pose_states import OK
 from anser_ros.sessions.baseline import check_place
 from anser_ros.sessions.follower import ModelFollower, RefitSummary
-from anser_ros.sessions.prepared import PreparedSession, prepare, settings_for, with_truth
-from anser_ros.sessions.session import Session, frames_of
+from anser_ros.sessions.prepared import PreparedSession, prepare, with_truth
+from anser_ros.sessions.session import Session, frames_of, settings_for
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
 from anser_ros.tracking.tracker import Observer, Tracker
 
