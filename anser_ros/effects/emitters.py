@@ -5,14 +5,13 @@ from dataclasses import dataclass, replace
 from itertools import combinations, permutations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.channels import ComplexGain
 from anser_ros.effects.effect import Effect, Remedy, Site, Term, sigmas
 from anser_ros.field.model import Dipoles, EffectRecord, size_figures, spread_along, symmetry_axis
-from anser_ros.physics.rotations import spatial
+from anser_ros.physics.rotations import rotation_of_vector, spatial
 
 
 def _of_one(term: Term, emitters: int, factor: complex) -> ComplexArray:
@@ -344,7 +343,7 @@ class CoilTurned(CoilMoved):
 
     def _moved(self, term: Term, place: Array, direction: Array) -> tuple[Array, Array]:
         assert isinstance(term, CoilTurnedTerm)
-        turn = Rotation.from_rotvec(term.seen @ term.theta).as_matrix()
+        turn = rotation_of_vector(term.seen @ term.theta)
         return (place - term.centre) @ turn.T + term.centre, direction @ turn.T
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:

@@ -6,13 +6,13 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
-from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import Effect, Remedy, Site, Term, TermT, sigmas
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.physics.rotations import rotation_of_vector
 
 
 class OpticalEffect(Effect[TermT]):
@@ -88,7 +88,7 @@ class Registration(OpticalEffect[Term]):
 
     def slopes(self, term: Term, view: View) -> ComplexArray:
         """Return the derivative by a turn about fg's origin and a shift, made the other way."""
-        back = Rotation.from_rotvec(term.theta[:3]).as_matrix().T
+        back = rotation_of_vector(term.theta[:3]).T
         turn = np.cross(view.centres[..., :, None], view.d_position, axis=2)
         turn = turn + np.cross(view.axes[..., :, None], view.d_axis, axis=2)
         out = view.columns(6)
@@ -98,6 +98,8 @@ class Registration(OpticalEffect[Term]):
         return out
 
     def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
+        from scipy.spatial.transform import Rotation  # loads slowly, and no live node needs it
+
         back = Rotation.from_rotvec(term.theta[:3]).inv()
         return PoseTrack(
             track.time,

@@ -5,14 +5,13 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import AnyArray, Array, Booleans, ComplexArray, Integers
 from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.effect import Effect, Family, Remedy, Site, Term, sigmas, whole_numbers
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
-from anser_ros.physics.rotations import spatial, tangents, tilted
+from anser_ros.physics.rotations import rotation_of_vector, spatial, tangents, tilted
 from anser_ros.physics.sensor import SensorTable, clusters_of
 
 
@@ -68,7 +67,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
             for row in np.flatnonzero(sensors.channel == term.site['channel']):
                 axis[row] = self._tilted(term)
         else:
-            turn = Rotation.from_rotvec(term.theta).as_matrix()
+            turn = rotation_of_vector(term.theta)
             rows = np.isin(sensors.channel, term.site['channels'])
             axis[rows] = axis[rows] @ turn.T
         return replace(sensors, axis=axis)
@@ -192,7 +191,7 @@ class BodyTurned(Effect[Term]):
 
     def table(self, term: Term, sensors: SensorTable) -> SensorTable:
         own = np.isin(sensors.channel, term.site['channels'])[:, None]
-        turn = Rotation.from_rotvec(term.theta).as_matrix()
+        turn = rotation_of_vector(term.theta)
         place, axis = (np.where(own, v @ turn.T, v) for v in (sensors.position, sensors.axis))
         return replace(sensors, position=place, axis=axis)
 

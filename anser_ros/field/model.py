@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from anser_ros.arrays import Array, ComplexArray, numbers_of
 from anser_ros.errors import ModelFileError
@@ -386,14 +385,16 @@ class FieldModel:
         """Return the dipoles alone."""
         return Dipoles(self.positions, self.directions, self.moments)
 
-    def turned(self, turn: Rotation, shift: Array) -> 'FieldModel':
-        """Return this model where its field is turned about fg's origin, then shifted (3,), m."""
+    def turned(self, turn: Array, shift: Array) -> 'FieldModel':
+        """Return this model where its field is turned about fg's origin by a rotation matrix, then
+        shifted (3,), m.
+        """
 
         def stands(one: Any) -> Any:
-            place, direction = turn.apply(one.positions) + shift, turn.apply(one.directions)
+            place, direction = one.positions @ turn.T + shift, one.directions @ turn.T
             return replace(one, positions=place, directions=direction)
 
-        arms = {b: OpenArm(a.sigma_m, turn.apply(a.turn.T).T) for b, a in self.open_arms.items()}
+        arms = {b: OpenArm(a.sigma_m, turn @ a.turn) for b, a in self.open_arms.items()}
         whole: FieldModel = replace(stands(self), open_arms=arms)
         return whole if self.gaps is None else replace(whole, gaps=stands(self.gaps))
 

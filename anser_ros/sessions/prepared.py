@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.readings import with_pose
 from anser_ros.calibration.result import residuals
@@ -11,6 +10,7 @@ from anser_ros.effects.correction import Correction
 from anser_ros.effects.effect import effect_named
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import SESSION, FieldModel
+from anser_ros.physics.rotations import rotation_of_vector
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.baseline import Baseline, clean_flux
@@ -117,7 +117,7 @@ def _stood(model: FieldModel, name: str) -> FieldModel:
         if given.pop(SESSION, name) != name:
             continue
         if SESSION in effect.parameters and effect_named(effect.name).is_frame:
-            turn = Rotation.from_rotvec(given['rotation_deg'], degrees=True)
+            turn = rotation_of_vector(np.radians(given['rotation_deg']))
             model = model.turned(turn, np.array(given['translation_m']))
         else:
             effects.append(replace(effect, parameters=given))
