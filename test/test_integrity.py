@@ -231,6 +231,36 @@ def test_a_leap_waits_for_three_frames_and_a_jerk_too():
     assert all(judged(jerk, ToolSettings(max_acceleration_m_s2=200.0)))
 
 
+@pytest.mark.parametrize('run', [1, 5])
+def test_what_jumps_there_and_back_gets_no_pose_though_each_place_is_good(run):
+    """A place out of reach, for a frame or confirmed by the next ones, three times within 2 s."""
+    one, times = Continuity(), []
+    for i in range(60):
+        x = 0.2 * (i > 20 and (i - 20) // run % 2)
+        stamp = round((1 + i) * 0.04e9)
+        one.judge(stamp, Place(stamp, (x, 0.0, 0.0), 1e-4), False, HANDS)
+        times.append(bool(one.alternates))
+    first = times.index(True)
+    assert first <= 21 + 4 * run + 1 and all(times[first:])
+    for i in range(61, 120):
+        stamp = round((1 + i) * 0.04e9)
+        one.judge(stamp, Place(stamp, (x, 0.0, 0.0), 1e-4), False, HANDS)
+    assert not one.alternates
+
+
+@pytest.mark.parametrize('rows', [(0, 1), (2,)])
+def test_a_tool_that_turns_over_in_a_frame_waits_as_one_that_jumps(rng, rows):
+    tool, seen = TOOL.select(list(rows)), []
+    tracker, still = Tracker(MODEL, tool), np.array([0.02, 0.01, 0.15])
+    over = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    for i in range(1, 40):
+        turn = over if i == 30 else np.eye(3)
+        place = still + (np.eye(3) - turn) @ tool.position[0]  # the coil stays
+        flux = fluxes(MODEL, tool, place, turn, rng)
+        seen.append({e.state for e in tracker.update(i * STEP_NS, tool.channel, flux)})
+    assert seen[29] == {'unconfirmed'} and {'ok'} in seen[30:33], seen
+
+
 # The model ------------------------------------------------------------------------------
 
 

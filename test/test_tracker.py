@@ -256,6 +256,23 @@ def test_metal_is_noticed_and_its_model_is_believed(rng):
     assert np.linalg.norm(informed['tool_a'].position - position) < 1e-4
 
 
+def test_nothing_among_the_dipoles_that_stand_for_metal_has_a_pose(rng):
+    """Neither coils that have just come there from elsewhere, nor their body."""
+    side = np.arange(-0.1, 0.101, 0.02)
+    places = np.stack([v.ravel() for v in np.meshgrid(side, side, [0.17])], axis=-1)
+    upright, none = np.tile([0.0, 0.0, 1.0], (len(places), 1)), np.zeros((len(places), 8))
+    model = MODEL.with_dipoles(places, upright, none.astype(complex))
+    modes = np.zeros((1, *model.moments.shape), dtype=complex)
+    modes[:, -len(places) :] = 1e-9
+    tracker, lying = Tracker(replace(model, modes=modes), TOOL), np.eye(3)[[1, 2, 0]]
+    for i in range(1, 30):
+        position = np.array([0.0, 0.0, 0.145 if i < 20 else 0.163])
+        flux = fluxes(MODEL, TOOL, position, lying, rng)
+        found = one_frame(tracker, flux, 2 * i * STEP_NS)
+        expected = states.OK if i < 20 else states.AMBIGUOUS
+        assert {e.state for e in found.values()} == {expected}, i
+
+
 def test_a_long_distortion_costs_few_scans_and_ends_in_less_than_a_second(rng):
     tracker = Tracker(MODEL, TOOL)
     bent = metal_near(MODEL, (0.05, 0.0, 0.04))

@@ -34,7 +34,7 @@ MOST_REFUSED = 0.5
 START_FRAMES = 3
 """Fewest consecutive frames, the last included, that confirm a pose: two wrong ones may agree."""
 ALTERNATES_S, FEWEST_JUMPS = 2.0, 3
-"""So many jumps within this time, s, to another pose that fits as well, and back, are no motion
+"""So many jumps within this time, s, to another pose that fits as well, or back, are no motion
 and no chance (once is a damaged record): two worlds take turns, as where a block is late."""
 ENDED_S = 0.8
 """Time, s, after the last jump from which on they have ended: such jumps are hardly further apart,
@@ -47,9 +47,18 @@ SIGMAS = 3.0
 """Allowance for the poses' own errors, in units of `Place.sigma_m`, beside the bounds."""
 
 
+ARM_M = 0.1
+"""Distance from a tool's place, m, at which its ends keep to the bounds of its motion too: a hand
+turns a tool by 20 rad/s at most, by 60 degrees from one frame to the next at 20 Hz. Smaller, and
+poses that turn over look like movements; larger, and quick turns of a short tool lose frames."""
+
+
 class Place(NamedTuple):
-    """States where something was, and how well that is known: stamp, position (m), its sigma,
-    m."""
+    """States where something was, and how well that is known: stamp, place, its sigma, m.
+
+    ``position`` is the position, m, and what turns about it at a distance of `ARM_M`, so that the
+    distance of two places is the root mean square of how far both ends have moved.
+    """
 
     stamp_ns: int
     position: Sequence[float]
@@ -151,6 +160,8 @@ class Continuity:
             return ''
         if not self._frames or motion_contradiction(self._run, place, tools):
             self._run, self._frames, self._began_ns = [], 0, stamp_ns
+            if contradiction and not old:
+                self._jumps.append(stamp_ns)
         self._run, self._frames = [*self._run[-1:], place], self._frames + 1
         if alone or self._is_confirmed(stamp_ns):
             self._track = list(self._run)

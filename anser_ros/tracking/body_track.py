@@ -231,7 +231,8 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
     if len(used) < 2 or not coils.subset(used).observable:
         count = f'{len(used)} of {len(frame.single)} coils usable'
         reason = f'{count}; two that are not parallel are needed'
-        worst = next((c.estimate.state for c in frame.single if not c.usable), states.STALE)
+        bad = (c.estimate.state for c in frame.single if not c.usable)
+        worst = next((state for state in bad if state != states.OK), states.AMBIGUOUS)
         return BodyResult(frame.no_pose(worst, reason))
     fits = _from_good(track, frame, used)
     continues = bool(fits)
@@ -248,7 +249,7 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
     result, gain = _judge(track, frame, fit, fits[1:], continues)
     if result.state == states.OK:
         track.remember(fit.solution, frame.stamp_ns)
-        track.noise.add(fit.ratio)
+        track.noise.add(fit.ratio, fit.solution.whitened, fit.freedom)
         left_out = frozenset(used.tolist()) - frozenset(fit.used.tolist())
         if left_out != track.left_out:
             track.left_out, track.again_ns = left_out, frame.stamp_ns + round(LEFT_OUT_S / NANO)

@@ -17,7 +17,14 @@ from anser_ros.tracking.descent import descend
 from anser_ros.tracking.estimate import TrackerSettings, add_frame, scale_of_frame, sigma_factor
 from anser_ros.tracking.solve import MAX_EVALUATIONS, CoilSolution, coil_covariance
 from anser_ros.tracking.solve_context import fill_model_errors
-from anser_ros.tracking.solve_verdict import SOUND, SYSTEMATIC, Freedom, fault_of, usual_and_most
+from anser_ros.tracking.solve_verdict import (
+    IN_METAL,
+    SOUND,
+    SYSTEMATIC,
+    Freedom,
+    fault_of,
+    usual_and_most,
+)
 
 SUSPICIOUS_JUMP_M = 0.02
 """A pose that moved further from one frame to the next, m, is confirmed by a scan, for it may be
@@ -278,6 +285,9 @@ def follow_coils(stamp_ns, values, sound, lengths, memory, model, rules, out):  
         if out.fault[s] == SOUND:
             if not take_errors(s, position, axis, lengths[row], values[row], memory, model):
                 return False
+            if memory.among[s] > 1.0 and rules.has_gate:  # where it is now, not where expected
+                out.fault[s] = IN_METAL
+                continue
             remember(s, stamp_ns, position, axis, out.residual[s], ratio, rules.freedom, memory)
     return True
 

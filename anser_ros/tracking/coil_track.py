@@ -231,8 +231,11 @@ def _scanned(
     """Judge the best solution of a scan and remember it as good or suspect."""
     judged = _judge(frame, solution, rivals)
     if judged.state == states.OK:
-        scans.forget()
         _take_errors(frame, solution.position, solution.axis)
+        if frame.among_metal:  # where it ended, not where it began
+            judged = _judge(frame, solution, rivals)
+    if judged.state == states.OK:
+        scans.forget()
         coil_step.remember(
             frame.row, frame.stamp_ns, solution.position, solution.axis, solution.residual,
             judged.chi2, float(frame.freedom.of_residual), frame.tracks.memory,

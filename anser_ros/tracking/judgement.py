@@ -15,7 +15,7 @@ import numpy as np
 from anser_ros import pose_states as states
 from anser_ros.arrays import Integers
 from anser_ros.integrity import pose_checks
-from anser_ros.integrity.pose_checks import STREAM_GAP_S, Continuity, Place
+from anser_ros.integrity.pose_checks import ARM_M, STREAM_GAP_S, Continuity, Place
 from anser_ros.stamps import NANO
 from anser_ros.tracking.body_track import BodyResult
 from anser_ros.tracking.coil_step import UNKNOWNS
@@ -140,8 +140,13 @@ class Judgement:
         if settings.judges:
             self._add_to_record(stamp_ns, found[: len(coils)])
             found = [self._judged_in_time(estimate, settings) for estimate in found]
+            single = set(range(len(coils)))
             for i, body in enumerate(bodies):
-                self._take_alternating(found, [*body.rows.tolist(), len(coils) + i])
+                rows = body.rows.tolist()
+                self._take_alternating(found, [*rows, len(coils) + i])
+                single.difference_update(rows)
+            for row in single:
+                self._take_alternating(found, [row])
         for estimate in found:
             if estimate.state == states.OK:
                 self._add_stamp_error(estimate, settings)
@@ -157,8 +162,7 @@ class Judgement:
         """The estimate, or why it is not given out: its own past, or that of the whole model."""
         place = None
         if estimate.state in (states.OK, states.INCONSISTENT):
-            where = estimate.position.tolist()
-            place = Place(estimate.stamp_ns, where, estimate.sigma_position_m)
+            place = _place_of(estimate)
         continuity = self._continuity.get(estimate.name)
         if continuity is None:
             continuity = self._continuity[estimate.name] = Continuity()
@@ -196,6 +200,21 @@ class Judgement:
             estimate.covariance, last.position, estimate.position, before, after,
             settings.stamp_sigma_s / seconds,
         )  # fmt: skip
+
+
+def _place_of(estimate: PoseEstimate) -> Place:
+    """Return the place of an estimate, with what turns about it; no roll of a single coil does."""
+    turns, covariance = estimate.rotation, estimate.covariance
+    tilt = covariance[3, 3] + covariance[4, 4] + covariance[5, 5]
+    if turns is None:
+        turns = estimate.axis
+        tilt -= turns @ covariance[3:, 3:] @ turns
+        arm = ARM_M
+    else:
+        arm = ARM_M / math.sqrt(2.0)  # of three axes two turn
+    where = [*estimate.position.tolist(), *(arm * turns).ravel().tolist()]
+    sigma_m = math.hypot(estimate.sigma_position_m, ARM_M * math.sqrt(max(tilt, 0.0)))
+    return Place(estimate.stamp_ns, where, sigma_m)
 
 
 def _add_gain_error(
