@@ -198,6 +198,26 @@ def test_a_survey_as_wrong_as_is_stated_contradicts_nothing(rng):
     assert states.INCONSISTENT not in seen
 
 
+@pytest.mark.parametrize(
+    ('rows', 'moved', 'size', 'up_m'),
+    [((0, 4), (4,), 1e-3, 0.15), (range(9), (3, 4, 5, 6, 7, 8), 2e-3, 0.17)],
+)
+def test_the_sigma_of_a_tool_that_is_bent_high_above_the_board_says_so(rows, moved, size, up_m):
+    """There single coils see too little to contradict each other."""
+    rng, aside, found = np.random.default_rng(5), np.zeros((9, 3)), []
+    aside[list(moved)] = size * np.array([0.6, 0.8, 0.0])
+    tool, bent = TOOL.select(list(rows)), replace(TOOL, position=TOOL.position + aside)
+    tracker, real = Tracker(MODEL, tool), bent.select(list(rows))
+    for stamp, position, rotation in path(200):
+        position = position + [0.0, 0.0, up_m]
+        flux = fluxes(MODEL, real, position, rotation, rng)
+        body = tracker.update(stamp, tool.channel, flux)[-1]
+        if body.state == states.OK:
+            error = np.linalg.norm(body.position - position)
+            found.append(error / max(3.0 * body.sigma_position_m, 1e-3))
+    assert len(found) > 10 and max(found) < 1.0
+
+
 # Continuity -----------------------------------------------------------------------------
 
 

@@ -27,9 +27,10 @@ Uncertainty = tuple[ComplexArray | None, float]
 
 MOST_MODES = 16
 """Sets of modes that are kept, which bounds the memory; the oldest is dropped."""
-LEAST_COMMON, COMMON_STEP = 2e-3, 1.5
-"""Change that all emitters have in common from which on it may be the references' own gain: it
-moves a coil alone by 0.1 mm at 0.15 m; and the ratio of neighbouring steps in which it counts."""
+LEAST_COMMON, COMMON_STEP = 5e-4, 1.5
+"""Change that all emitters have in common from which on it may be the references' own gain: what
+is less leaves a coil 0.1 m above the board a residual of twice the noise; and the ratio of
+neighbouring steps in which it counts."""
 KEEP_FRAMES = 25
 """Frames for which an inflation is kept at least before it may fall."""
 RIVAL = 0.05

@@ -17,7 +17,7 @@ from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSetting
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve import bounded_inverse
 from anser_ros.tracking.solve_context import strength_errors
-from anser_ros.tracking.solve_verdict import RARE, Freedom, SolveFrame
+from anser_ros.tracking.solve_verdict import RARE, SYSTEMATIC, Freedom, SolveFrame, usual_and_most
 
 DISAGREES = 4.0
 """A coil is left out when its share of the misfit is so many times the mean of the others'."""
@@ -309,9 +309,14 @@ def _judge(
         for rival in rivals
         if rival.solution.converged and _apart(rival.solution, solution)
     )
+    checks = len(fit.used) * frame.context.readings - UNKNOWNS
+    freedom = Freedom(fit.freedom, UNKNOWNS, RARE, checks)
+    usual, _ = usual_and_most(frame.settings, freedom)
+    if fit.ratio > usual and len(fit.used) < len(frame.usable):
+        # Some disagreed, and the others do not agree without them.
+        covariance = SYSTEMATIC * covariance
     estimate = frame.estimate(
-        track.noise, solution,
-        Freedom(fit.freedom, UNKNOWNS, RARE, len(fit.used) * frame.context.readings - UNKNOWNS),
+        track.noise, solution, freedom,
         (position, rotation[:, 2].copy(), rotation), lambda scale: covariance + by_gain / scale,
         others,
         position + rotation @ frame.coils.subset(fit.used).offsets.mean(axis=0),

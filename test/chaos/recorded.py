@@ -272,12 +272,17 @@ class Drift:
 
 ONE, PARALLEL, EMITTERS, DRIFTS = (4,), (2, 8), tuple(range(8)), (2.0, 5.0, 15.0)
 BENDS, SLIDES, GATES = (1.0, 3.0, 8.0), (3.0, 15.0, 60.0), (8.0, 100.0, 1e6)
+SMALL_BENDS, SLOW_DRIFTS = (0.8, 1.6, 3.0), (0.5, 1.0, 2.0)
 GAINS, EVERY = (1.0, 1.5, 2.0), (2.0, 5.0, 20.0)
 RECORDED = (
     Drift('still', 'nothing, seed of the way', lambda size, **w: trial(**w), (1.0,)),
     Drift('bent-tip', 'three coils of nine aside, mm', partial(bent, moved=ALL[:3]), BENDS),
     Drift('bent', 'six coils of nine aside, mm', partial(bent, moved=ALL[:6]), BENDS),
     Drift('bent-end', 'the other six aside, mm', partial(bent, moved=ALL[3:]), BENDS),
+    Drift('bent-high', 'six coils of nine aside, high up, mm',
+          partial(bent, moved=ALL[:6], up_m=0.15), SMALL_BENDS),
+    Drift('bent-two', 'one of two coils aside, high up, mm',
+          partial(bent, moved=ONE, coils=(0, 4), up_m=0.15), SMALL_BENDS),
     Drift('slide', 'all references slide, mm/min', slid, SLIDES),
     Drift('slide-slow', 'the same for minutes', partial(slid, seconds=200.0, rate_hz=5.0),
           (1.0, 3.0)),
@@ -297,6 +302,10 @@ RECORDED = (
           partial(exchanged, order=(3, 4, 5, 6, 7, 8, 0, 1, 2)), EVERY),
     Drift('exchanged', 'two clusters exchanged in one frame of',
           partial(exchanged, order=(3, 4, 5, 0, 1, 2, 6, 7, 8)), EVERY),
+    Drift('turned-over', 'two coils alone exchanged in one frame of',
+          partial(exchanged, order=(1, 0, *ALL[2:]), coils=ALL[:2]), EVERY),
+    Drift('references-slow', 'references drift, all coils, %/min',
+          partial(faded, references=32), SLOW_DRIFTS),
     Drift('drift-one', 'emitter drifts, one coil, %/min', partial(faded, coils=ONE), DRIFTS),
     Drift('drift-parallel', 'the same, two coils', partial(faded, coils=PARALLEL), DRIFTS),
     Drift('references-one', 'references drift, one coil, %/min',
