@@ -281,7 +281,7 @@ class BodySolution:
     def whitened(self) -> Array:
         """Return the residuals without what coils share, (S 2K,): noise of one each."""
         white = self.rows[0]
-        return white - (self.common @ white) @ self.common
+        return np.asarray(white - (self.common @ white) @ self.common)
 
     def gain(self, covariance: Array) -> tuple[float, Array]:
         """Return what a gain of all coils may be off by, and what a gain does to the pose (6,).
