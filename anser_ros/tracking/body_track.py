@@ -8,6 +8,7 @@ import numpy as np
 
 from anser_ros import pose_states as states
 from anser_ros.arrays import Array, Integers
+from anser_ros.integrity.pose_checks import is_part
 from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.stamps import NANO
 from anser_ros.tracking import rigid
@@ -251,6 +252,8 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
         track.remember(fit.solution, frame.stamp_ns)
         track.noise.add(fit.ratio, fit.solution.whitened, fit.freedom)
         left_out = frozenset(used.tolist()) - frozenset(fit.used.tolist())
+        if is_part(coils.offsets, left_out, fit.used.tolist()):
+            left_out = frozenset()  # the body waits for it, and asks again in the next frame
         if left_out != track.left_out:
             track.left_out, track.again_ns = left_out, frame.stamp_ns + round(LEFT_OUT_S / NANO)
     return BodyResult(result, fit, gain)

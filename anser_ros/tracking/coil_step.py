@@ -50,7 +50,7 @@ class CoilMemory(NamedTuple):
     # good, before: (S, 6), position, m, and unit axis of these poses, frame fg
     good: Array
     before: Array
-    noise: Array  # (S, 3), see `NoiseScale`
+    noise: Array  # (S, 4), see `NoiseScale`
     whitened: Array  # (S, 2K), residuals at the last good pose, in sigmas; NaN for none
     # What the model's uncertainty does to a coil at a pose, and is reused while the coil is near
     error_at: Array  # (S, 6), the pose

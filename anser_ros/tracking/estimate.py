@@ -33,6 +33,9 @@ others gets, as a smooth distortion looks more like a pose than like anything el
 SLIGHT = 0.1
 """Residual power that lasts from frame to frame, in units of the expected power, up to which it is
 no misfit: of noise alone, a coil with eight emitters has 0 +- 0.02."""
+SUDDEN_FRAMES, SUDDEN = 8.0, 0.5
+"""Good frames over which such power is averaged besides, and beyond which it is misfit: of noise
+alone it has 0 +- 0.08. The long mean alone lets a bend of 0.8 mm pass for noise for a second."""
 
 
 @inlined
@@ -158,8 +161,9 @@ def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) ->
     )  # fmt: skip
 
 
-FRESH_NOISE = PRIOR_FRAMES, PRIOR_FRAMES, 0.0
-"""State of a noise scale before the first frame: weight, power, and power that lasts."""
+FRESH_NOISE = PRIOR_FRAMES, PRIOR_FRAMES, 0.0, 0.0
+"""State of a noise scale before the first frame: weight, power, and power that lasts, over many
+frames in units of the weight, and over few."""
 
 
 @inlined
@@ -171,12 +175,13 @@ def scale_of_frame(noise, ratio, usual, share, model_share, follows):  # type: i
     scale = max(least, 1.0) if follows else least
     scale *= 1.0 + model_share * max(hidden - 1.0, 0.0)
     expected = min(least, 1.0) if follows else least
-    return scale + hidden * max(misfit, ratio - usual * expected)
+    sudden = noise[3] - model_share - SUDDEN
+    return scale + hidden * max(misfit, sudden, ratio - usual * expected)
 
 
 @inlined
 def add_frame(noise, ratio, lasting):  # type: ignore[no-untyped-def]
-    """Take a good frame into the state (3,) of a noise scale, see `NoiseScale.add`.
+    """Take a good frame into the state (4,) of a noise scale, see `NoiseScale.add`.
 
     ``lasting`` is the product of its whitened residuals and the last frame's per freedom.
     """
@@ -184,6 +189,7 @@ def add_frame(noise, ratio, lasting):  # type: ignore[no-untyped-def]
     noise[0] = keep * noise[0] + 1.0
     noise[1] = keep * noise[1] + min(ratio, most)
     noise[2] = keep * noise[2] + min(lasting, most)
+    noise[3] += (min(lasting, most) - noise[3]) / SUDDEN_FRAMES
 
 
 class NoiseScale:
@@ -191,7 +197,7 @@ class NoiseScale:
 
     An exponential mean over about `MEMORY_FRAMES` good frames; it starts as if `PRIOR_FRAMES` had
     been as expected. Noise is new in each frame; what stays in the residuals from one frame to the
-    next is misfit. ``state`` (3,) is written over, as kernels do.
+    next is misfit. ``state`` (4,) is written over, as kernels do.
     """
 
     def __init__(self, state: Array | None = None) -> None:

@@ -110,11 +110,14 @@ class Judgement:
     def __init__(self) -> None:
         self._continuity: dict[str, Continuity] = {}
         self._last: dict[str, PoseEstimate] = {}
+        # The two parts of a body that contradicted each other and have not agreed since, and why
+        self._split: dict[str, tuple[set[int], set[int], str]] = {}
         self.record = ModelRecord()
 
     def forget(self) -> None:
         self._continuity.clear()
         self._last.clear()
+        self._split.clear()
         self.record.forget()
 
     def judged(
@@ -135,7 +138,7 @@ class Judgement:
         _add_gain_error(found, coils, alone, math.nan)
         of_bodies = [body.result.estimate for body in bodies]
         if settings.judges:
-            of_bodies = [_judged_by_coils(found, body, settings) for body in bodies]
+            of_bodies = [self._judged_by_coils(found, body, settings) for body in bodies]
         found += of_bodies
         if settings.judges:
             self._add_to_record(stamp_ns, found[: len(coils)])
@@ -151,6 +154,43 @@ class Judgement:
             if estimate.state == states.OK:
                 self._add_stamp_error(estimate, settings)
         return found
+
+    def _judged_by_coils(
+        self, found: Estimates, body: RigidBody, settings: TrackerSettings
+    ) -> PoseEstimate:
+        """Return a body's estimate; withhold, in ``found``, the poses of coils that contradict it.
+
+        If all coils together fit the model in no pose, even without those that disagree most, it
+        is unknown which of them are right: a smooth distortion can look like a pose to each. So it
+        is where one part of the tool contradicts the other, see `pose_checks.is_part`, and stays
+        until a frame in which coils of both agree: a bend lasts, also where one part is unseen.
+        """
+        estimate, fit = body.result.estimate, body.result.fit
+        members = {i for i, row in enumerate(body.rows.tolist()) if found[row].state == states.OK}
+        if fit is None or not members:
+            return estimate
+        against: dict[int, str] = {}
+        if estimate.state == states.RESIDUAL:
+            why = f"the body's coils fit no pose together: {estimate.reason}"
+            against = dict.fromkeys(members, why)
+        elif estimate.state in (states.OK, states.OUTSIDE_VOLUME):
+            against = _contradictions(found, body, sorted(members), settings)
+            agree = members & set(fit.used.tolist()) - {*against}
+            apart = members - agree
+            if against and pose_checks.is_part(body.coils.offsets, apart, agree):
+                words = next(iter(against.values()))
+                why = f'{len(apart)} of {len(members)} coils contradict the others: {words}'
+                self._split[estimate.name] = apart, agree, why
+            elif all(agree & part for part in self._split.get(estimate.name, ())[:2]):
+                self._split.pop(estimate.name, None)
+            if estimate.name in self._split:
+                why = self._split[estimate.name][2]
+                against = dict.fromkeys(members, why)
+                estimate = replace(estimate, state=states.INCONSISTENT, reason=why)
+        for i, why in against.items():
+            row = int(body.rows[i])
+            found[row] = replace(found[row], state=states.INCONSISTENT, reason=why)
+        return estimate
 
     def _add_to_record(self, stamp_ns: int, coils: Estimates) -> None:
         refused = [math.sqrt(e.chi2) for e in coils if e.state in CONTRADICTS]
@@ -226,35 +266,6 @@ def _add_gain_error(
         if solution is not None and one.state == states.OK:
             misfit = max(one.chi2 - 1.0, 0.0) * (solution.residual.size - UNKNOWNS)
             add_gain(one.covariance, solution.normal, solution.axis, gain, misfit)
-
-
-def _judged_by_coils(found: Estimates, body: RigidBody, settings: TrackerSettings) -> PoseEstimate:
-    """Return a body's estimate; withhold, in ``found``, the poses of coils that contradict it.
-
-    If all coils together fit the model in no pose, even without those that disagree most, it is
-    unknown which of them are right: a smooth distortion can look like a pose to each. So it is
-    where one part of the tool contradicts the other, see `pose_checks.is_part`.
-    """
-    estimate, fit = body.result.estimate, body.result.fit
-    members = [i for i, row in enumerate(body.rows.tolist()) if found[row].state == states.OK]
-    if fit is None or not members:
-        return estimate
-    against: dict[int, str] = {}
-    if estimate.state == states.RESIDUAL:
-        why = f"the body's coils fit no pose together: {estimate.reason}"
-        against = dict.fromkeys(members, why)
-    elif estimate.state in (states.OK, states.OUTSIDE_VOLUME):
-        against = _contradictions(found, body, members, settings)
-        apart = {*against, *members} - (set(fit.used.tolist()) - {*against})
-        if against and pose_checks.is_part(body.coils.offsets, apart, {*members} - apart):
-            words = next(iter(against.values()))
-            why = f'{len(apart)} of {len(members)} coils contradict the others: {words}'
-            against = dict.fromkeys(members, why)
-            estimate = replace(estimate, state=states.INCONSISTENT, reason=why)
-    for i, why in against.items():
-        row = int(body.rows[i])
-        found[row] = replace(found[row], state=states.INCONSISTENT, reason=why)
-    return estimate
 
 
 def _contradictions(
