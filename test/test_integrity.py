@@ -142,6 +142,21 @@ def test_clusters_that_are_permuted_now_and_then_give_no_pose(rng):
     assert {e.state for e in found[-1].values()} == {'ok'}
 
 
+def test_no_coil_is_left_out_where_the_others_could_not_contradict_the_pose(rng):
+    """Three coils of three emitters: any two of them fit some pose, whatever the third says."""
+    few = replace(
+        MODEL, moments=MODEL.moments[:, :3], emitters=MODEL.emitters[:3],
+        frequencies_hz=MODEL.frequencies_hz[:3],
+    )  # fmt: skip
+    tool = TOOL.select(np.arange(len(TOOL)) < 3)
+    tracker = Tracker(few, tool)
+    for i, (stamp, position, rotation) in enumerate(path(20)):
+        seen = fluxes(few, tool, position, rotation, rng)
+        seen[2] *= 1.0 if i < 10 else 1.3
+        body = tracker.update(stamp, tool.channel, seen)[-1]
+        assert body.state == (states.OK if i < 10 else states.RESIDUAL), i
+
+
 @pytest.mark.parametrize('gate', [8.0, 100.0, 1e6])
 def test_a_wide_gate_of_residuals_leaves_rigidity_and_continuity(rng, gate):
     def swap(i, seen):
@@ -239,6 +254,14 @@ def test_what_slips_through_a_long_refusal_waits_for_a_run():
     assert not any(late)
     found = judged([0.0] * 10 + [None] * 100 + [0.1] * 40)
     assert not any(found[110:122]) and all(found[123:])
+
+
+def test_most_of_the_last_single_points_refused_withhold_the_others():
+    """A source that was moved: some points pass by chance, however far apart they are in time."""
+    assert all(judged([0.0] * 10 + [None] + [0.1] * 10, step_s=1.0)[11:])
+    found = judged([0.0] * 12 + ([None] * 3 + [0.1]) * 10, step_s=1.0)
+    assert all(found[:12]) and not any(found[23::4])
+    assert all(judged([None] * 12 + [0.1] * 20, step_s=1.0)[18:]), 'given again after as many'
 
 
 def test_a_leap_waits_for_three_frames_and_a_jerk_too():

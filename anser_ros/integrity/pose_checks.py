@@ -2,8 +2,8 @@
 
 A single residual that passes the gate proves little when most of its neighbours in time do not: a
 few wrong poses pass by chance. So after withheld poses a pose needs consistent ones before it.
-Points that were recorded one by one, further apart than `STREAM_GAP_S`, have no neighbours in
-time, and each is judged alone.
+Points that were recorded one by one, further apart than `STREAM_GAP_S`, have no motion that could
+contradict them; but a model that most of the last ones contradict is wrong for the others too.
 
 A body's pose predicts the place of each of its coils, and each coil has its own pose. A coil whose
 two differ by more than their errors, the survey's and that of its gain is in another place, or is
@@ -31,6 +31,9 @@ RECORD_S = 1.0
 """How far back refusals count, s; after a distortion has ended a tool waits as long."""
 MOST_REFUSED = 0.5
 """Share (0 to 1) of refused frames from which on a pass is more likely chance than not."""
+LAST_POINTS = 12
+"""Single points whose refusals count. Fewer, and two bad ones withhold good ones; more, and a
+source that was moved gives poses for longer."""
 START_FRAMES = 3
 """Fewest consecutive frames, the last included, that confirm a pose: two wrong ones may agree."""
 ALTERNATES_S, FEWEST_JUMPS = 2.0, 3
@@ -104,6 +107,7 @@ class Continuity:
     """Judges one sensor's or body's poses through time."""
 
     def __init__(self) -> None:
+        self._points: deque[bool] = deque(maxlen=LAST_POINTS)
         self.forget()
 
     @property
@@ -121,7 +125,7 @@ class Continuity:
         return f'the readings jump to another pose and back, {times}: a fault of the line'
 
     def forget(self) -> None:
-        """Forget all frames that were judged so far."""
+        """Forget all frames that were judged so far, but for which single points were refused."""
         self._jumps: deque[int] = deque()
         self._away: Place | None = None
         self._track: list[Place] = []
@@ -140,6 +144,8 @@ class Continuity:
         alone = not last_ns or not 0 < stamp_ns - last_ns <= STREAM_GAP_S / NANO
         if alone:
             self.forget()
+            if place is not None or refused:
+                self._points.append(place is None)
         if other is not None and self._track and self._track[-1].stamp_ns == last_ns:
             self._away = other
         elif place is not None and self._away is not None and self._track:
@@ -165,13 +171,19 @@ class Continuity:
         self._run, self._frames = [*self._run[-1:], place], self._frames + 1
         if alone or self._is_confirmed(stamp_ns):
             self._track = list(self._run)
-            return ''
+            return self._against_points() if alone else ''
         if contradiction and not old:
             return contradiction
         return (
             f'{100 * self.refused_share:.0f} % of the frames of the last second were refused, '
             f'and {self._frames} good frames in a row are too few'
         )
+
+    def _against_points(self) -> str:
+        """Return that most of the last single points were refused; empty where they were not."""
+        refused, count = sum(self._points), len(self._points)
+        against = refused > MOST_REFUSED * count
+        return f'{refused} of the last {count} points were refused' if against else ''
 
     def _is_confirmed(self, stamp_ns: int) -> bool:
         """Whether the run is long enough: as long as refusals were lately, up to a bound."""

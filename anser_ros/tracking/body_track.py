@@ -145,6 +145,10 @@ class BodyFrame(SolveFrame):
         """Return the inverse of each sigma, 1/T, shape (2K,)."""
         return 1.0 / self.context.sigma
 
+    def checks(self, used: Integers) -> int:
+        """Return how many readings of some coils are beyond the pose's unknowns."""
+        return len(used) * self.context.readings - UNKNOWNS
+
     def shared(self, used: Integers, start: Start) -> Array:
         """Return errors (S, R, 2K) that some coils share, T, one standard deviation each."""
         coils, (position, rotation) = self.coils.subset(used), start
@@ -190,7 +194,11 @@ def solve_with(frame: BodyFrame, used: Integers, start: Start) -> BodyFit:
 
 
 def _without_disagreeing(fit: BodyFit, frame: BodyFrame, gate: float) -> BodyFit:
-    """Leave out, one by one, up to a third of the coils while one of them spoils the fit."""
+    """Leave out, one by one, up to a third of the coils while one of them spoils the fit.
+
+    What is left must be able to contradict the pose: whatever is wrong, three coils of three
+    emitters fit some pose without the coil that disagrees most.
+    """
     for _ in range(len(fit.used) // 3):
         if fit.ratio <= gate**2:
             break
@@ -198,7 +206,7 @@ def _without_disagreeing(fit: BodyFit, frame: BodyFrame, gate: float) -> BodyFit
         worst = int(np.argmax(misfit))
         others = np.delete(misfit, worst)
         rest = np.delete(fit.used, worst)
-        if len(rest) < 2 or not frame.coils.subset(rest).observable:
+        if frame.checks(rest) <= 0 or not frame.coils.subset(rest).observable:
             break
         if misfit[worst] < DISAGREES * others.mean():
             break
@@ -312,8 +320,7 @@ def _judge(
         for rival in rivals
         if rival.solution.converged and _apart(rival.solution, solution)
     )
-    checks = len(fit.used) * frame.context.readings - UNKNOWNS
-    freedom = Freedom(fit.freedom, UNKNOWNS, RARE, checks)
+    freedom = Freedom(fit.freedom, UNKNOWNS, RARE, frame.checks(fit.used))
     usual, _ = usual_and_most(frame.settings, freedom)
     if fit.ratio > usual and len(fit.used) < len(frame.usable):
         # Some disagreed, and the others do not agree without them.
