@@ -148,7 +148,7 @@ def test_no_coil_is_left_out_where_the_others_could_not_contradict_the_pose(rng)
         MODEL, moments=MODEL.moments[:, :3], emitters=MODEL.emitters[:3],
         frequencies_hz=MODEL.frequencies_hz[:3],
     )  # fmt: skip
-    tool = TOOL.select(np.arange(len(TOOL)) < 3)
+    tool = TOOL.select(np.array([0, 4, 8]))
     tracker = Tracker(few, tool)
     for i, (stamp, position, rotation) in enumerate(path(20)):
         seen = fluxes(few, tool, position, rotation, rng)
