@@ -546,3 +546,23 @@ def test_a_scale_of_all_sensors_is_named_as_such_beside_a_bend():
     found = named(diagnose_poses(world.session()))
     assert found['optical_scale'].parameters['scale'] == pytest.approx(1.012, abs=2e-3)
     assert set(found) <= {'optical_scale', 'field_distortion'}
+
+
+@pytest.mark.parametrize('is_turned', [False, True])
+def test_metal_that_stands_in_the_volume_turns_sensors_and_a_map_of_the_trackers_own_does_not(
+    is_turned,
+):
+    world = World(977, duration=60.0)
+
+    def distorted(streams):
+        for name in ('sensor_0', 'sensor_1'):
+            away = (streams[name][1] - [0.15, 0.02, -0.3]) / 0.12
+            near = np.exp(-np.sum(away**2, axis=1, keepdims=True))
+            streams[name][1] = streams[name][1] + 0.015 * near * [0.7, 0.5, -0.5]
+            if is_turned:
+                turn = Rotation.from_rotvec(np.deg2rad(8) * near * [0.5, 0.5, 0.7])
+                streams[name][2] = (turn * Rotation.from_quat(streams[name][2])).as_quat()
+        return streams
+
+    world.after = distorted
+    assert ('moving_metal' in named(diagnose_poses(world.session()))) == is_turned

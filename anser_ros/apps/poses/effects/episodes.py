@@ -36,6 +36,12 @@ are off; share of those elsewhere that may be; percentile of the right poses' di
 must be nearer than: the edge of the volume errs without metal."""
 NEIGHBOURS = 3  # windows by which those of one episode are apart at most
 PASSED = 'metal stands at one place, and the sensors are off whenever they pass it'
+STANDING = np.array([2e-3, 0.0175])
+"""Errors, m and rad, that neighbours share, beyond which metal bends all of the space: data sheets
+say 0.5 to 1.4 mm and 0.5 deg, of which this is twice; maps of a tracker's own hardly turn."""
+EACH = 0.25  # share of the mean squared turn that each sensor must have: a mount turns one alone
+NEAR_STEPS = 3.0  # usual intervals by which neighbours in time are apart at most
+BENDS = 'metal stands in the volume, and turns the sensors from place to place'
 LOOSE, FAST = 0.5, 0.25
 """Share of a sensor's squared error that shifts in the body's frame explain if its mount is loose,
 and up to which the others' must be lower."""
@@ -263,7 +269,34 @@ class PoseMovingMetal(PoseEffect):
                 {'t_start_s': length, 't_end_s': length},
                 {'summary': PASSED} if places else {},
             ))  # fmt: skip
-        return records
+        return records or _standing(residuals)
+
+
+def _standing(residuals: PoseResiduals) -> list[EffectRecord]:
+    """Metal that stands in the volume: it moves and turns all sensors, alike at near poses."""
+    squares, turns, places = [], [], []
+    for sensing in residuals.sensors:
+        rows, view = np.flatnonzero(sensing.used), sensing.view
+        step = np.diff(view.time[rows])
+        near = np.flatnonzero(step <= NEAR_STEPS * np.median(step)) if step.size else step
+        if len(near) < FEWEST_POSES_OF_WINDOW:
+            return []
+        errors = np.hstack([view.measured - view.position, sensing.residual[:, 3:]])[rows]
+        # What goes along the turning is an error of times.
+        spin = view.velocity[rows, 3:]
+        spin = spin / np.maximum(np.linalg.norm(spin, axis=1, keepdims=True), 1e-9)
+        errors[:, 3:] -= np.sum(errors[:, 3:] * spin, axis=1, keepdims=True) * spin
+        common = np.sum((errors[near] * errors[near + 1]).reshape(-1, 2, 3), axis=2)
+        squares.append(common.mean(axis=0))
+        turns.append(common[:, 1].max())
+        places.append(view.measured[rows[near[np.argmax(common[:, 1])]]].tolist())
+    mean = np.mean(squares, axis=0)
+    if (mean < STANDING**2).any() or min(squares, key=lambda s: s[1])[1] < EACH * mean[1]:
+        return []
+    start, names = residuals.setting.start, [s.view.sensor for s in residuals.sensors]
+    values = {'t_start_s': start, 't_end_s': start + residuals.setting.duration,
+              'sensors': names, 'place_m': places[int(np.argmax(turns))]}  # fmt: skip
+    return [EffectRecord(PoseMovingMetal.name, values, {}, {'summary': BENDS})]
 
 
 def _stretches(windows: Sequence[int]) -> list[list[int]]:
