@@ -157,6 +157,22 @@ def test_no_coil_is_left_out_where_the_others_could_not_contradict_the_pose(rng)
         assert body.state == (states.OK if i < 10 else states.RESIDUAL), i
 
 
+@pytest.mark.parametrize('rows', [(2, 8), (2, 5, 8)])
+@pytest.mark.parametrize('every', [1, 2, 5])
+def test_parallel_coils_that_are_exchanged_along_their_axis_contradict_each_other(
+    rng, rows, every
+):
+    tool = TOOL.select(list(rows))
+    tracker = Tracker(MODEL, tool)
+    for i, (stamp, position, rotation) in enumerate(path(60)):
+        flux = fluxes(MODEL, tool, position, rotation, rng)
+        turned = i >= FAULT and i % every == 0
+        found = tracker.update(stamp, tool.channel, flux[::-1] if turned else flux)
+        assert wrong_and_ok(found, position, rotation) == [], i
+        if i < FAULT or turned:
+            assert {e.state for e in found} == {states.INCONSISTENT if turned else states.OK}, i
+
+
 @pytest.mark.parametrize('gate', [8.0, 100.0, 1e6])
 def test_a_wide_gate_of_residuals_leaves_rigidity_and_continuity(rng, gate):
     def swap(i, seen):

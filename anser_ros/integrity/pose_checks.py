@@ -338,6 +338,33 @@ def distances(
     return found
 
 
+def strangers(
+    offsets: Array, axes: Array, places: Sequence[Place], sigmas_m: Array, tools: ToolSettings
+) -> Array:
+    """Return by how much, m, coils contradict most of the others of their body, (S,); else 0.
+
+    They are rigid although the body has no pose: the two ends of a coil, its place and a point on
+    its axis at `ARM_M`, are at known distances from those of another, so that parallel coils
+    along their axis are told from each other. ``offsets``, ``axes`` (S, 3) are the coils' in the
+    body, ``places`` where they say that they are, ``sigmas_m`` (S,) those of the positions.
+    """
+    said = np.array([place.position for place in places]).reshape(-1, 2, 3).cumsum(axis=1)
+    ends = np.stack([offsets, offsets + ARM_M * axes], axis=1)
+    known, found = (
+        np.linalg.norm(e[:, None, :, None] - e[None, :, None, :], axis=4) for e in (ends, said)
+    )
+    sigmas = np.stack([sigmas_m, [place.sigma_m for place in places]], axis=1)
+    survey = tools.tool_coil_position_m * np.array([1.0, 1.0])
+    survey[1] = math.hypot(survey[0], ARM_M * tools.tool_coil_axis_rad)
+    error = np.hypot(sigmas[:, None, :, None], sigmas[None, :, None, :])
+    stated = np.hypot(survey[:, None], survey)
+    allowed = np.maximum(np.maximum(BODY_SIGMAS * error, HARMFUL_M), SURVEYS * stated)
+    off = abs(found - known)
+    off = np.where(off > allowed, off, 0.0).max(axis=(2, 3))
+    is_most = 2 * np.count_nonzero(off, axis=1) > len(offsets) - 1
+    return np.asarray(np.where(is_most, off.max(axis=1), 0.0))
+
+
 def reason(distance: float, away_m: float, turned_rad: float) -> str:
     """Return what is said of a coil that contradicts its body."""
     sigmas = math.sqrt(distance)

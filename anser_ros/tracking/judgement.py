@@ -126,8 +126,12 @@ class Judgement:
         coils: Sequence[CoilResult],
         bodies: Sequence[RigidBody],
         settings: TrackerSettings,
+        loose: Sequence[tuple[Integers, BodyCoils]] = (),
     ) -> Estimates:
-        """Return the estimates of a frame, sensors first, with what the checks say of them."""
+        """Return the estimates of a frame, sensors first, with what the checks say of them.
+
+        ``loose`` are the rows and coils of bodies that have no pose in this frame.
+        """
         found = [result.estimate for result in coils]
         alone = set(range(len(coils)))
         for body in bodies:
@@ -139,6 +143,8 @@ class Judgement:
         of_bodies = [body.result.estimate for body in bodies]
         if settings.judges:
             of_bodies = [self._judged_by_coils(found, body, settings) for body in bodies]
+            for rows, table in loose:
+                _take_strangers(found, rows, table, settings)
         found += of_bodies
         if settings.judges:
             self._add_to_record(stamp_ns, found[: len(coils)])
@@ -148,8 +154,10 @@ class Judgement:
                 rows = body.rows.tolist()
                 self._take_alternating(found, [*rows, len(coils) + i])
                 single.difference_update(rows)
-            for row in single:
-                self._take_alternating(found, [row])
+            groups = [rows.tolist() for rows, _ in loose]
+            single.difference_update(*groups)
+            for group in (*groups, *([row] for row in single)):
+                self._take_alternating(found, group)
         for estimate in found:
             if estimate.state == states.OK:
                 self._add_stamp_error(estimate, settings)
@@ -266,6 +274,22 @@ def _add_gain_error(
         if solution is not None and one.state == states.OK:
             misfit = max(one.chi2 - 1.0, 0.0) * (solution.residual.size - UNKNOWNS)
             add_gain(one.covariance, solution.normal, solution.axis, gain, misfit)
+
+
+def _take_strangers(
+    found: Estimates, rows: Integers, coils: BodyCoils, settings: TrackerSettings
+) -> None:
+    """Withhold, in ``found``, the poses of coils of a body without a pose that cannot be of it."""
+    good = np.array([i for i, row in enumerate(rows) if found[row].state == states.OK], np.int64)
+    if len(good) < 2:
+        return
+    coils, ones = coils.subset(good), [found[row] for row in rows[good].tolist()]
+    places = [_place_of(one) for one in ones]
+    sigmas = np.array([one.sigma_position_m for one in ones])
+    off = pose_checks.strangers(coils.offsets, coils.axes, places, sigmas, settings.tools)
+    for i in np.flatnonzero(off).tolist():
+        why = f'{1e3 * off[i]:.2g} mm off its distance from the other coils of the body'
+        found[int(rows[good[i]])] = replace(ones[i], state=states.INCONSISTENT, reason=why)
 
 
 def _contradictions(

@@ -97,6 +97,8 @@ class TrackedScene:
     table: SensorTable = field(init=False)  # The sensors as the model's effects have them
     # Rows and coils of the bodies whose six degrees of freedom their coils see
     bodies: dict[str, tuple[Integers, rigid.BodyCoils]] = field(init=False)
+    # The same of those whose coils are all parallel
+    parallel: list[tuple[Integers, rigid.BodyCoils]] = field(init=False)
     # The context of the last frame in which emitters were dead
     reduced: ReducedScene | None = None
 
@@ -104,7 +106,7 @@ class TrackedScene:
         corrected = self.correction
         self.table = table = self.sensors if corrected is None else corrected.sensors()
         changes = None if corrected is None else corrected.gain_changes()
-        self.bodies = {}
+        self.bodies, self.parallel = {}, []
         for body in dict.fromkeys(table.body):
             rows = np.array([i for i, name in enumerate(table.body) if name == body])
             coils = rigid.BodyCoils(
@@ -113,6 +115,8 @@ class TrackedScene:
             )  # fmt: skip
             if coils.observable:
                 self.bodies[body] = (rows, coils)
+            elif len(rows) > 1:
+                self.parallel.append((rows, coils))
 
     def with_model(
         self, model: FieldModel, settings: TrackerSettings, model_id: str | None = None
@@ -334,7 +338,11 @@ class Tracker:
         if learns:
             looks = self._looks(frames, bodies, coils, values, context)
             self._past.strengths.learn(stamp_ns, looks)
-        judged = self._past.judgement.judged(stamp_ns, coils, bodies, self.settings)
+        loose = [*self._scene.parallel]
+        loose += [(body.rows, body.coils) for body in bodies if body.result.fit is None]
+        if context.symmetry is not None:
+            loose = []  # where coils are about the axis of the field is not known
+        judged = self._past.judgement.judged(stamp_ns, coils, bodies, self.settings, loose)
         model = self.model
         if model is not None and model.shift_sigma_m > 0.0:
             # No judge reckons with it: what all poses share contradicts none of them.
