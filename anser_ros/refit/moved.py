@@ -1,5 +1,5 @@
-"""Asks whether the frame of the references, or an emitter, has moved, or a gain that all have in
-common, beside metal or without.
+"""Asks whether the frame of the references, a part of it, or an emitter, has moved, or a gain
+that all have in common, beside metal or without.
 
 What slides as one is no metal, but clouds of metal explain a slide quite well, and a model that
 follows them is wrong by as much. So "this has moved, and metal may be there too" is a hypothesis
@@ -16,11 +16,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from anser_ros.arrays import Array
+from anser_ros.arrays import Array, Integers
 from anser_ros.integrity.board_place import FAR_M, FAR_SIGMAS, PRIOR_M, PRIOR_RAD
 from anser_ros.integrity.clean_references import DrawnReadings
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import FieldFunction
+from anser_ros.refit.parts import Parts
 from anser_ros.refit.posterior import Bank, FrameEvidence, log_sum, make_room
 from anser_ros.stamps import NANO
 
@@ -32,6 +33,10 @@ an X-ray head touches the board, and simulated slides of 0.05 mm are at 100 to 2
 COMMON_GAIN, LEAST_GAIN = 0.05, 1e-4
 """Standard deviation of a gain that all references, or all emitters, have in common, as when one
 amplifier or supply warms up; and the least that counts: it moves no pose by more than 10 um."""
+PART_ODDS = 100.0
+"""Log odds from which on a part of the references is believed to have moved: as those of a coil
+that is at fault (`health.FAULT_ODDS`), for the part is chosen among all, and metal that clouds
+describe badly reaches 70."""
 IMPROBABLE = 40.0
 """Log odds against a strength, beside the best one, from which on it is left out: 1 in 10^17."""
 MOST_KEPT = 64
@@ -53,6 +58,7 @@ class FrameMotion:
         noise_t: float,
     ) -> None:  # fmt: skip
         self._points, self._last_ns, self._emitters = references.position, 0, emitters
+        self._parts, self._asks_parts = Parts(), False
         self._known: dict[tuple[object, ...], tuple[Array, Array, Array]] = {}
         self.forget()
         drawn = DrawnReadings.of(field, references.position, references.axis, references.length)
@@ -69,12 +75,16 @@ class FrameMotion:
     def forget(self) -> None:
         """Believe that nothing has moved, and look with the next frame."""
         self._next_ns, self._away, self.reason, self.gain = 0.0, (0, 0.0), '', 0.0
+        self._parts.forget()
 
     def look(self, stamp_ns: int, bank: Bank, seen: FrameEvidence) -> None:
         """Take in a frame's evidence; it is looked at every `LOOK_S`."""
         if self._last_ns <= stamp_ns < self._next_ns:
             return
         self._last_ns, self._next_ns = stamp_ns, stamp_ns + LOOK_S / NANO
+        self._asks_parts = not self._asks_parts  # every other time, for what it costs
+        if self._away[0] < 0 and not self._asks_parts:
+            return
         odds, best = np.full(self._things, -np.inf), (-np.inf, 0, np.zeros(6), np.eye(6))
         for hypothesis in {0, seen.best}:
             columns, factor, half_log_det = self._known_of(bank, hypothesis, seen.noise)
@@ -96,8 +106,10 @@ class FrameMotion:
             if evidence[what] > best[0]:
                 top = int(gained[:, what].argmax())
                 best = float(evidence[what]), what, white[top, what], factor[top, what]
-        _, what, white, factor = best
+        evidence, what, white, factor = best
         motion, sigma = white @ factor, np.sqrt((factor**2).sum(axis=0))
+        if self._asks_parts and seen.best > 0 and self._is_part(bank, seen, evidence):
+            return
         # Far away a motion is not linear any more, and not seen beside metal: it must come back.
         if float(odds.max()) - log_sum(seen.log_evidence) > MOVED_ODDS:
             if what == len(odds) - 1:
@@ -108,22 +120,38 @@ class FrameMotion:
         elif seen.best == 0:
             self.reason, self._away = '', (0, 0.0)
 
-    def _said(self, what: int, motion: Array, sigma: Array) -> str:
-        """Return how far a motion (6,) takes the references, or an emitter, where that is certain
-        and too far until the next look.
+    def _is_part(self, bank: Bank, seen: FrameEvidence, evidence: float) -> bool:
+        """Say how far a part of the references has moved, if that is more probable than metal
+        alone and than whatever else has the log ``evidence``; return whether it is.
         """
-        kinds = 3 if what else 6  # an emitter's fourth factor is its strength
-        shift, turn = PRIOR_M * motion[:3], PRIOR_RAD * motion[3:] * (what == 0)
-        away = float(np.linalg.norm(shift + np.cross(turn, self._points), axis=1).max())
+        whole = self._columns.reshape(len(self._columns), self._things, 6)[:, 0]
+        part = self._parts.look(bank, seen, whole)
+        if part.log_evidence <= max(PART_ODDS + log_sum(seen.log_evidence), evidence):
+            return False
+        self.reason = self._said(-len(part.coils), part.motion, part.sigma, part.coils)
+        return True
+
+    def _said(
+        self, what: int, motion: Array, sigma: Array, coils: Integers | slice = slice(None)
+    ) -> str:
+        """Return how far a motion (6,) takes the references, or some ``coils`` of them, or the
+        emitter ``what``, where that is certain and too far until the next look.
+        """
+        kinds = 3 if what > 0 else 6  # an emitter's fourth factor is its strength
+        shift, turn = PRIOR_M * motion[:3], PRIOR_RAD * motion[3:] * (what <= 0)
+        points = self._points[coils]
+        away = float(np.linalg.norm(shift + np.cross(turn, points), axis=1).max())
         before = self._away[1] if self._away[0] == what else 0.0
         self._away = what, away
         is_certain = (np.abs(motion) > FAR_SIGMAS * sigma)[:kinds].any()
         if not is_certain or max(away, 2.0 * away - before) < FAR_M:
             return ''
         words = ', '.join(f'{1e3 * v:+.1f}' for v in shift)
-        who = f'emitter {self._emitters[what - 1]} has' if what else 'the references have'
+        who = f'emitter {self._emitters[what - 1]} has' if what > 0 else 'the references have'
+        if what < 0:
+            who = f'{len(points)} of {len(self._points)} references have'
         by = f'by up to {1e3 * away:.1f} mm ({words} along x, y, z)'
-        return f'{who} moved {"on" if what else "as one against"} the board, {by}'
+        return f'{who} moved {"on" if what > 0 else "as one against"} the board, {by}'
 
     def _known_of(self, bank: Bank, hypothesis: int, noise: float) -> tuple[Array, Array, Array]:
         """Return what a hypothesis and the noise decide for each thing that may move: the columns

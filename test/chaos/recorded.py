@@ -176,8 +176,10 @@ def bent(size: float, moved: tuple[int, ...], **world: Any) -> Trial:
     return t
 
 
-def slid(size: float, knock: bool = False, **world: Any) -> Trial:
-    """Move all references as one, mm/min, or mm at once."""
+def slid(
+    size: float, knock: bool = False, part: slice = slice(None), **world: Any
+) -> Trial:  # fmt: skip
+    """Move all references as one, or a part of them, mm/min, or mm at once."""
     t = trial(**{'seconds': 60.0, 'rate_hz': 10.0, **world})
     far = 1e-3 * size * ((t.after > 0.0) if knock else t.after / 60.0)
     moved = []
@@ -185,7 +187,7 @@ def slid(size: float, knock: bool = False, **world: Any) -> Trial:
         turn = rotation_of_vector(away * np.array([0.4, -0.6, 2.0]))
         places = REFERENCE.position @ turn.T + away * np.array([0.7, 0.5, -0.51])
         moved.append(read(real_board()[1], places, REFERENCE.axis @ turn.T, REFERENCE))
-    t.reference += np.array(moved) - moved[0]
+    t.reference[:, part] += (np.array(moved) - moved[0])[:, part]
     return t
 
 
@@ -272,6 +274,7 @@ class Drift:
 
 ONE, PARALLEL, EMITTERS, DRIFTS = (4,), (2, 8), tuple(range(8)), (2.0, 5.0, 15.0)
 BENDS, SLIDES, GATES = (1.0, 3.0, 8.0), (3.0, 15.0, 60.0), (8.0, 100.0, 1e6)
+PARTS, ALWAYS = (3.0, 30.0, 60.0), (1.0, 2.0, 5.0)
 SMALL_BENDS, SLOW_DRIFTS = (0.8, 1.6, 3.0), (0.5, 1.0, 2.0)
 GAINS, EVERY = (1.0, 1.5, 2.0), (2.0, 5.0, 20.0)
 RECORDED = (
@@ -287,6 +290,11 @@ RECORDED = (
     Drift('slide-slow', 'the same for minutes', partial(slid, seconds=200.0, rate_hz=5.0),
           (1.0, 3.0)),
     Drift('slide-metal', 'the same near moving metal', partial(slid, metal=True), SLIDES),
+    Drift('slide-part', 'a quarter of the references slide, mm/min',
+          partial(slid, part=slice(8)), PARTS),
+    Drift('slide-most', 'three quarters of them', partial(slid, part=slice(24)), PARTS),
+    Drift('slide-most-metal', 'the same near moving metal',
+          partial(slid, part=slice(24), metal=True), PARTS),
     Drift('knock', 'all references are knocked aside, mm', partial(slid, knock=True),
           (0.6, 2.0, 20.0)),
     Drift('gain-high', 'gain of the tool, high up, %', partial(gained, up_m=0.1), GAINS),
@@ -304,6 +312,8 @@ RECORDED = (
           partial(exchanged, order=(3, 4, 5, 0, 1, 2, 6, 7, 8)), EVERY),
     Drift('turned-over', 'two coils alone exchanged in one frame of',
           partial(exchanged, order=(1, 0, *ALL[2:]), coils=ALL[:2]), EVERY),
+    Drift('parallel', 'two parallel coils exchanged in one frame of',
+          partial(exchanged, order=(0, 1, 8, 3, 4, 5, 6, 7, 2), coils=PARALLEL), ALWAYS),
     Drift('references-slow', 'references drift, all coils, %/min',
           partial(faded, references=32), SLOW_DRIFTS),
     Drift('drift-one', 'emitter drifts, one coil, %/min', partial(faded, coils=ONE), DRIFTS),
