@@ -21,7 +21,7 @@ from anser_ros.integrity.board_place import FAR_M, FAR_SIGMAS, PRIOR_M, PRIOR_RA
 from anser_ros.integrity.clean_references import DrawnReadings
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import FieldFunction
-from anser_ros.refit.parts import Parts
+from anser_ros.refit.parts import MovedParts
 from anser_ros.refit.posterior import Bank, FrameEvidence, log_sum, make_room
 from anser_ros.stamps import NANO
 
@@ -58,7 +58,7 @@ class FrameMotion:
         noise_t: float,
     ) -> None:  # fmt: skip
         self._points, self._last_ns, self._emitters = references.position, 0, emitters
-        self._parts, self._asks_parts = Parts(), False
+        self._parts, self._asks_parts = MovedParts(), False
         self._known: dict[tuple[object, ...], tuple[Array, Array, Array]] = {}
         self.forget()
         drawn = DrawnReadings.of(field, references.position, references.axis, references.length)

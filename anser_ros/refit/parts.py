@@ -15,12 +15,13 @@ from anser_ros.refit.health import MOST_AT_ONCE
 from anser_ros.refit.posterior import Bank, FrameEvidence, log_sum, make_room
 
 MOST_CHANGES = 6
-"""Changes of a part in one look; the next look goes on."""
+"""Changes of a part in one look, each the evidence of as many parts as there are coils; the next
+look goes on where one ends, so that more would cost time only."""
 MOST_KEPT = 16
 """Hypotheses whose products are kept, 0.3 MB each."""
 
 
-class Part(NamedTuple):
+class MovedPart(NamedTuple):
     """States the log evidence that some coils have moved as one, by how much (6,), and the sigma
     of that (6,); in the units of the columns that were given.
     """
@@ -31,10 +32,11 @@ class Part(NamedTuple):
     sigma: Array
 
 
-NO_PART = Part(-np.inf, np.empty(0, np.int64), np.zeros(6), np.zeros(6))
+NO_PART = MovedPart(-np.inf, np.empty(0, np.int64), np.zeros(6), np.zeros(6))
+"""No coils, which have not moved: of no evidence, so that any part is more probable."""
 
 
-class Parts:
+class MovedParts:
     """Remembers from one look to the next which coils were thought to have moved."""
 
     def __init__(self) -> None:
@@ -45,7 +47,7 @@ class Parts:
         """Believe again that all coils move, if any."""
         self._members: dict[tuple[bool, bytes], Booleans] = {}
 
-    def look(self, bank: Bank, seen: FrameEvidence, columns: Array) -> Part:
+    def look(self, bank: Bank, seen: FrameEvidence, columns: Array) -> MovedPart:
         """Return the most probable part of the coils in use, where something has changed.
 
         ``columns`` (all readings, 6) are what a motion of all makes of the readings.
@@ -72,7 +74,7 @@ class Parts:
                 covariance = np.linalg.inv(inside)
                 motion = covariance @ scores[members].sum(axis=0)
                 sigma = np.sqrt(np.diag(covariance))
-                best = Part(log_evidence, numbers[members], motion, sigma)
+                best = MovedPart(log_evidence, numbers[members], motion, sigma)
         return best
 
     def _products_of(
