@@ -58,7 +58,7 @@ class FrameMotion:
         noise_t: float,
     ) -> None:  # fmt: skip
         self._points, self._last_ns, self._emitters = references.position, 0, emitters
-        self._parts, self._asks_parts = MovedParts(), False
+        self._parts = MovedParts()
         self._known: dict[tuple[object, ...], tuple[Array, Array, Array]] = {}
         self.forget()
         drawn = DrawnReadings.of(field, references.position, references.axis, references.length)
@@ -76,6 +76,7 @@ class FrameMotion:
         """Believe that nothing has moved, and look with the next frame."""
         self._next_ns, self._away, self.reason, self.gain = 0.0, (0, 0.0), '', 0.0
         self._parts.forget()
+        self._asks_parts = False
 
     def look(self, stamp_ns: int, bank: Bank, seen: FrameEvidence) -> None:
         """Take in a frame's evidence; it is looked at every `LOOK_S`."""
@@ -83,7 +84,7 @@ class FrameMotion:
             return
         self._last_ns, self._next_ns = stamp_ns, stamp_ns + LOOK_S / NANO
         self._asks_parts = not self._asks_parts  # every other time, for what it costs
-        if self._away[0] < 0 and not self._asks_parts:
+        if self.reason and self._away[0] < 0 and not self._asks_parts:
             return
         odds, best = np.full(self._things, -np.inf), (-np.inf, 0, np.zeros(6), np.eye(6))
         for hypothesis in {0, seen.best}:
@@ -128,14 +129,14 @@ class FrameMotion:
         part = self._parts.look(bank, seen, whole)
         if part.log_evidence <= max(PART_ODDS + log_sum(seen.log_evidence), evidence):
             return False
-        self.reason = self._said(-len(part.coils), part.motion, part.sigma, part.coils)
+        self.reason = self._said(-1, part.motion, part.sigma, part.coils)
         return True
 
     def _said(
         self, what: int, motion: Array, sigma: Array, coils: Integers | slice = slice(None)
     ) -> str:
         """Return how far a motion (6,) takes the references, or some ``coils`` of them, or the
-        emitter ``what``, where that is certain and too far until the next look.
+        emitter ``what`` from 1 on, where that is certain and too far until the next look.
         """
         kinds = 3 if what > 0 else 6  # an emitter's fourth factor is its strength
         shift, turn = PRIOR_M * motion[:3], PRIOR_RAD * motion[3:] * (what <= 0)
