@@ -295,7 +295,8 @@ def _fit_as_scan(
     if bare is not None:
         same = replace(options, layout=calibration.layout)
         calibration = fit_scan(bare, names, generator, same, progress)
-    if options.layout is None:
+    # Who says what to fit, or that nothing is to be found of sensors, gets that, with its error.
+    if options.layout is None and options.estimate:
         check_explained(calibration, setup.accuracy.optical_position_m)
     scan = calibration.scan
     scan = replace(scan, reported_effects=(*scan.reported_effects, *drifts))
