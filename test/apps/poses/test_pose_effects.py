@@ -194,7 +194,10 @@ def episodes_of(spans, *, returns=False, shared_m=0.0):
         for first, last, pulls in spans:
             residual[(time > first) & (time < last), 0] += pulls[k]
         still, noise = np.zeros((time.size, 6)), PoseNoise(3e-4, 3e-4)
-        view = SimpleNamespace(sensor=f'sensor_{k}', time=time, measured=place, velocity=still)
+        view = SimpleNamespace(
+            sensor=f'sensor_{k}', time=time, measured=place, velocity=still,
+            position=place - residual[:, :3],
+        )  # fmt: skip
         every = np.ones(time.size, dtype=bool)
         sensors.append(Plain(view=view, residual=residual, noise=noise, used=every, out=~every))
     setting = PoseSetting(('sensor_0', 'sensor_1', 'sensor_2'), 0.0, 40.0, np.zeros(3), 0.1)
