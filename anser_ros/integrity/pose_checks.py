@@ -354,8 +354,8 @@ def strangers(
         np.linalg.norm(e[:, None, :, None] - e[None, :, None, :], axis=4) for e in (ends, said)
     )
     sigmas = np.stack([sigmas_m, [place.sigma_m for place in places]], axis=1)
-    survey = tools.tool_coil_position_m * np.array([1.0, 1.0])
-    survey[1] = math.hypot(survey[0], ARM_M * tools.tool_coil_axis_rad)
+    aside = tools.tool_coil_position_m
+    survey = np.array([aside, math.hypot(aside, ARM_M * tools.tool_coil_axis_rad)])
     error = np.hypot(sigmas[:, None, :, None], sigmas[None, :, None, :])
     stated = np.hypot(survey[:, None], survey)
     allowed = np.maximum(np.maximum(BODY_SIGMAS * error, HARMFUL_M), SURVEYS * stated)

@@ -10,6 +10,7 @@ than noise; what is unknown of it is in the sigma of poses, and in the gate.
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from anser_ros.tracking import body_track, coil_step, rigid
 from anser_ros.tracking.body_track import BodyFit, BodyFrame
 from anser_ros.tracking.estimate import USUAL_GATE
 from anser_ros.tracking.solve import RealField
-from anser_ros.tracking.solve_context import AS_THEY_ARE, strength_errors
+from anser_ros.tracking.solve_context import AS_THEY_ARE
 
 PACE_S = 0.2
 """Time between frames that are learnt from, s: a strength changes by 1e-4 in it."""
@@ -187,13 +188,9 @@ class EmitterStrengths:
         weights, shared = frame.inverse_sigma, frame.shared(used, start)
         if not fit.good(USUAL_GATE):
             known = self._covariance[: self._width, : self._width]
-            own = strength_errors(flux, np.asarray(np.linalg.cholesky(known), np.float64))
-            common = rigid.common_factor(np.concatenate([shared, own], axis=1), weights)
-            part, context = frame.coils.subset(used), frame.context
-            solution = rigid.solve_body(
-                context.field, part, flux, weights, common, *start,
-                context.low - part.reach, context.high + part.reach,
-            )  # fmt: skip
+            unknown = frame.context.with_strengths(np.linalg.cholesky(known))
+            frame = replace(frame, context=unknown)
+            solution = body_track.solve_with(frame, used, start).solution
         away = self._mean[: self._width].copy()
         if self.used is not None:
             away -= self.used.view(np.float64)
