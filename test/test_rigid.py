@@ -12,14 +12,16 @@ from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.estimate import TrackerSettings
-from anser_ros.tracking.rigid import BodyCoils, common_factor, solve_body, start_from_coils
-from anser_ros.tracking.solve import RealField, bounded_inverse
-from anser_ros.tracking.solve_context import (
-    NOT_FINITE,
-    fill_model_errors,
-    source_spacing,
-    strength_errors,
+from anser_ros.tracking.rigid import (
+    BodyCoils,
+    carried_on,
+    common_factor,
+    fill_common,
+    solve_body,
+    start_from_coils,
 )
+from anser_ros.tracking.solve import RealField, bounded_inverse
+from anser_ros.tracking.solve_context import NOT_FINITE, fill_model_errors, source_spacing
 from anser_ros.tracking.tracker import Tracker
 
 SEED = 41
@@ -107,6 +109,40 @@ def test_errors_that_all_coils_share_do_not_average_out(rng):
     assert solve(1.01 * clean, position, rotation).chi2 > 100.0
 
 
+def test_what_coils_have_in_common_is_what_each_error_makes_of_them(rng):
+    """Modes of the model, a gain of some coils, and the emitters' strengths."""
+    position, rotation = random_pose(rng)
+    flux = real(fluxes(MODEL, TOOL, position, rotation, rng))
+    points, axes = TOOL.placed(position, rotation)
+    modes = 1e-5 * rng.normal(size=(len(MODEL.positions), 2, WIDTH))
+    changes = 0.01 * rng.normal(size=(1, 9))
+    strengths = 1e-3 * rng.normal(size=(WIDTH, 3))
+    basis = flux_basis(points, axes, TOOL.length, MODEL.positions, MODEL.directions)
+    relative = (strengths[0::2] + 1j * strengths[1::2]).T
+    by_strength = np.ascontiguousarray(flux.view(complex)[:, None] * relative).view(float)
+    each = [np.einsum('sn,nrk->srk', basis, modes), (changes.T * flux)[:, None], by_strength]
+    out = np.empty((6, flux.size))
+    assert fill_common(
+        position, rotation, COILS.offsets, COILS.axes, COILS.lengths, changes, flux,
+        columns_of(MODEL), modes.reshape(len(modes), -1), 1.0 / WEIGHTS, strengths, out,
+    )  # fmt: skip
+    expected = common_factor(np.concatenate(each, axis=1), WEIGHTS)
+    np.testing.assert_allclose(out, expected, rtol=1e-7, atol=1e-9)
+
+
+def test_motion_is_carried_on_as_it_was(rng):
+    position, rotation = random_pose(rng)
+    for steps in (0.5, 1.0, 2.3):
+        move, turn = 0.01 * rng.normal(size=3), 0.2 * rng.normal(size=3)
+        now = position + move, rotation_of_vector(turn) @ rotation
+        found = carried_on(*now, position, rotation, steps)
+        np.testing.assert_allclose(found[0], position + (1 + steps) * move, atol=1e-12)
+        expected = rotation_of_vector((1 + steps) * turn) @ rotation
+        np.testing.assert_allclose(found[1], expected, atol=1e-9)
+    still = carried_on(position, rotation, position, rotation, 1.0)
+    np.testing.assert_allclose(still[1], rotation, atol=1e-12)
+
+
 def test_start_from_the_coils_own_poses(rng):
     position, rotation = random_pose(rng)
     points, axes = TOOL.placed(position, rotation)
@@ -172,7 +208,6 @@ def both(modes, sigma, length):
     covariance = np.diag(sigma**2) + flux[:, 0].T @ flux[:, 0]
     relative = strengths[0::2] + 1j * strengths[1::2]
     by_strength = (seen.view(complex)[1][:, None] * relative).T.copy().view(float)
-    np.testing.assert_allclose(strength_errors(seen, strengths)[1], by_strength)
     covariance += by_strength.T @ by_strength
     return np.linalg.inv(np.linalg.cholesky(covariance)), weights[1]
 

@@ -88,9 +88,8 @@ def symmetry_axis(
 
     Positions (m) and unit directions (N, 3) are in the frame fg, moments (N, K) in A m^2.
     """
-    size = np.abs(moments)
-    strong = size > OFF_AXIS * size.max()
-    used = strong.any(axis=1)
+    power = (moments.real**2 + moments.imag**2).sum(axis=1)
+    used = power > OFF_AXIS**2 * power.max()
     if not used.any():
         return None
     places = positions[used]
@@ -102,7 +101,7 @@ def symmetry_axis(
         return None
     vectors = (moments.real @ np.ones(moments.shape[1]))[:, None] * directions
     total = vectors.sum(axis=0)
-    if np.linalg.norm(total) < OFF_AXIS * size.sum():
+    if np.linalg.norm(total) < OFF_AXIS * np.abs(moments).sum():
         return None
     axis = total / np.linalg.norm(total)
     weight = vectors[used] @ axis

@@ -8,16 +8,15 @@ import numpy as np
 
 from anser_ros import pose_states as states
 from anser_ros.arrays import Array, Integers
+from anser_ros.errors import TrackingError
 from anser_ros.integrity.pose_checks import is_part
-from anser_ros.physics.rotations import rotation_between, rotation_of_vector
 from anser_ros.stamps import NANO
 from anser_ros.tracking import rigid
 from anser_ros.tracking.coil_step import MOST_STEPS, SUSPICIOUS_JUMP_M
 from anser_ros.tracking.coil_track import CoilResult
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings
 from anser_ros.tracking.seed import SAME_PLACE_M
-from anser_ros.tracking.solve import bounded_inverse
-from anser_ros.tracking.solve_context import strength_errors
+from anser_ros.tracking.solve_context import NOT_FINITE
 from anser_ros.tracking.solve_verdict import RARE, SYSTEMATIC, Freedom, SolveFrame, usual_and_most
 
 DISAGREES = 4.0
@@ -90,11 +89,10 @@ class BodyTrack(Track):
         if self.before is None or steps == 0.0:
             return good.position, good.rotation
         old = self.before[1]
-        turn = rotation_between(old.rotation, good.rotation)
-        return (
-            good.position + steps * (good.position - old.position),
-            rotation_of_vector(steps * turn) @ good.rotation,
+        start: Start = rigid.carried_on(
+            good.position, good.rotation, old.position, old.rotation, steps
         )
+        return start
 
 
 @dataclass(frozen=True)
@@ -130,10 +128,14 @@ class BodyResult:
 
 @dataclass
 class BodyFrame(SolveFrame):
-    """Holds a body's fluxes (S, 2K), its coils, and what each of these found by itself."""
+    """Holds a body's fluxes (S, 2K), its coils, and what each of these found by itself.
+
+    ``own`` are positions (S, 3), m, axes (S, 3) and normal matrices (S, 6, 6) of their solutions.
+    """
 
     coils: rigid.BodyCoils
     single: list[CoilResult]
+    own: tuple[Array, Array, Array]
 
     @property
     def usable(self) -> Integers:
@@ -149,34 +151,36 @@ class BodyFrame(SolveFrame):
         """Return how many readings of some coils are beyond the pose's unknowns."""
         return len(used) * self.context.readings - UNKNOWNS
 
-    def shared(self, used: Integers, start: Start) -> Array:
-        """Return errors (S, R, 2K) that some coils share, T, one standard deviation each."""
-        coils, (position, rotation) = self.coils.subset(used), start
-        gains = coils.gain_errors(self.flux[used])
-        if self.context.modes is None:
-            return gains
-        points, axes = coils.offsets @ rotation.T + position, coils.axes @ rotation.T
-        modes = self.context.errors_at(points, axes, coils.lengths)
-        return np.concatenate([modes, gains], axis=1) if gains.shape[1] else modes
+    def common(self, used: Integers, start: Start, strengths: Array | None = None) -> Array:
+        """Return what some coils' errors have in common, see `fill_common`.
 
-    def common(self, used: Integers, start: Start) -> Array:
-        """Return what these and the emitters' strengths do, see `common_factor`."""
-        shared, strengths = self.shared(used, start), self.context.strengths
-        if strengths.size:
-            own = strength_errors(self.flux[used], strengths)
-            shared = np.concatenate([shared, own], axis=1)
-        return rigid.common_factor(shared, self.inverse_sigma)
+        Errors of the emitters' ``strengths`` are those of the context unless others are given.
+        """
+        coils, of, flux = self.coils.subset(used), self.context.arrays, self.flux[used]
+        strengths = of.strengths if strengths is None else strengths
+        changes = coils.gain_changes
+        rank = of.modes.shape[1] // flux.shape[1] + len(changes) + strengths.shape[1]
+        out = np.empty((rank, flux.size))
+        if not rigid.fill_common(
+            *start, coils.offsets, coils.axes, coils.lengths, changes, flux, of.uncertain,
+            of.modes, of.sigma, strengths, out,
+        ):  # fmt: skip
+            raise TrackingError(NOT_FINITE)
+        return out
 
     def nearer(self, start: Start, used: Integers) -> Start:
         """Return a start moved to where the coils' own good poses agree best."""
-        rows = [i for i in used.tolist() if self.single[i].estimate.state == states.OK]
-        coils = self.coils.subset(np.array(rows, dtype=np.int64))
+        good = [i for i in used.tolist() if self.single[i].estimate.state == states.OK]
+        coils, own = self.coils, self.own
+        if len(good) < len(coils.axes):
+            coils, own = (
+                coils.subset(np.array(good, np.int64)),
+                (own[0][good], own[1][good], own[2][good]),
+            )
         if not coils.observable:
             return start
-        known = [s for s in (self.single[i].solution for i in rows) if s is not None]
         nearer: Start = rigid.step_to_coils(
-            *start, coils.offsets, coils.axes, np.array([s.position for s in known]),
-            np.array([s.axis for s in known]), np.array([s.normal for s in known]),
+            *start, coils.offsets, coils.axes, *own,
             self.context.low - coils.reach, self.context.high + coils.reach,
         )  # fmt: skip
         return nearer
@@ -185,7 +189,7 @@ class BodyFrame(SolveFrame):
 def solve_with(frame: BodyFrame, used: Integers, start: Start) -> BodyFit:
     """Return the fit of some of a body's coils from a start near it."""
     part, context = frame.coils.subset(used), frame.context
-    flux = np.ascontiguousarray(frame.flux[used])
+    flux = frame.flux[used]
     solution = rigid.solve_body(
         context.field, part, flux, frame.inverse_sigma, frame.common(used, start), *start,
         context.low - part.reach, context.high + part.reach,
@@ -278,11 +282,13 @@ def _on_other_sides(frame: BodyFrame, fit: BodyFit) -> list[BodyFit]:
     other side the field that half a turn about z makes of it: what is read cannot tell them apart.
     """
     solution, middle = fit.solution, frame.context.middle
-    lever = frame.coils.offsets[fit.used].mean(axis=0)
+    lever = frame.coils.subset(fit.used).middle
     place, found = solution.position + solution.rotation @ lever - middle, []
     for signs in OTHER_SIDES:
-        across, away = middle + signs * place, (signs - 1.0) * place
-        if frame.settings.box.contains(across) and np.linalg.norm(away) > SAME_PLACE_M:
+        across = middle + signs * place
+        if not frame.settings.box.contains(across):
+            continue
+        if np.linalg.norm((signs - 1.0) * place) > SAME_PLACE_M:
             rotation = -signs[:, None] * solution.rotation
             found.append(solve_with(frame, fit.used, (across - rotation @ lever, rotation)))
     return found
@@ -311,9 +317,8 @@ def _judge(
 ) -> tuple[PoseEstimate, float]:
     """The estimate, and by how much a common gain may be off, the error of which it has too."""
     solution = fit.solution
-    covariance = bounded_inverse(solution.information)
-    gain, carried = solution.gain(covariance)
-    by_gain = np.outer(gain * carried, gain * carried)
+    covariance, gain = solution.covariance, solution.gain
+    by_gain = np.outer(gain * solution.carried, gain * solution.carried)
     position, rotation = solution.position, solution.rotation
     others = (
         (rival.solution.chi2, 'another pose')
@@ -329,7 +334,7 @@ def _judge(
         track.noise, solution, freedom,
         (position, rotation[:, 2].copy(), rotation), lambda scale: covariance + by_gain / scale,
         others,
-        position + rotation @ frame.coils.subset(fit.used).offsets.mean(axis=0),
+        position + rotation @ frame.coils.subset(fit.used).middle,
         continues=continues,
     )  # fmt: skip
     left_out = len(frame.single) - len(fit.used)

@@ -21,7 +21,7 @@ from anser_ros.tracking.estimate import FRESH_NOISE, NoiseScale, PoseEstimate, T
 from anser_ros.tracking.seed import solve_cold
 from anser_ros.tracking.solve import CoilSolution, coil_covariance, solve_coil, whitening_of
 from anser_ros.tracking.solve_context import NOT_FINITE, ErrorModes, SolveContext
-from anser_ros.tracking.solve_verdict import SOUND, Freedom, SolveFrame, millimetres
+from anser_ros.tracking.solve_verdict import Freedom, SolveFrame, millimetres
 
 FIRST_RETRY_S, LAST_RETRY_S = 0.05, 0.25
 """Pauses after a scan without a good pose, s: the first one, which doubles from scan to scan, and
@@ -52,7 +52,12 @@ class Scans:
 
 
 class CoilTracks:
-    """Remembers coils, a row each, and solves them near where they are expected."""
+    """Remembers coils, a row each, and solves them near where they are expected.
+
+    ``freedom`` is what the readings of the last frame left to the pose of each.
+    """
+
+    freedom: Freedom
 
     def __init__(self, count: int) -> None:
         self.scans = [Scans() for _ in range(count)]
@@ -108,6 +113,7 @@ class CoilTracks:
         """Solve all coils near where they are expected; see `follow_coils`."""
         out, memory = coil_step.Followed.empty(*values.shape), self.prepare(context)
         ruled, freedom = self._ruled, coil_step.freedom_of(values.shape[1], context.readings)
+        self.freedom = freedom
         if ruled is None or ruled[0] is not settings or ruled[1] != freedom:
             ruled = self._ruled = settings, freedom, coil_step.rules_of(settings, freedom)
         if context.readings >= coil_step.UNKNOWNS and not coil_step.follow_coils(
@@ -116,19 +122,31 @@ class CoilTracks:
             raise TrackingError(NOT_FINITE)
         return out
 
+    def followed(
+        self, row: int, name: str, stamp_ns: int, ended: coil_step.Followed, model_id: str
+    ) -> 'CoilResult':
+        """Return what `follow` found of a coil that is good where it was expected."""
+        self.scans[row].forget()
+        found, freedom = ended.solution(row), self.freedom
+        estimate = PoseEstimate(
+            name, stamp_ns, states.OK, found.position, found.axis, None, ended.covariance[row],
+            float(ended.residual_t[row]), found.chi2 / freedom.of_residual, model_id, '',
+            freedom.checks,
+        )  # fmt: skip
+        return CoilResult(estimate, found, False, bool(self.memory.among[row] > 1.0))
+
 
 @dataclass
 class CoilFrame(SolveFrame):
-    """Holds one sensor's fluxes (2K,), finite, its length, m, and its row among the tracks."""
+    """Holds one sensor's fluxes (2K,), finite, its length, m, and its row among the tracks.
+
+    ``freedom`` is what the readings leave to the pose.
+    """
 
     length: float
     row: int
     tracks: CoilTracks
-
-    @property
-    def freedom(self) -> Freedom:
-        """Return what the readings leave to the pose."""
-        return coil_step.freedom_of(self.flux.size, self.context.readings)
+    freedom: Freedom
 
     @property
     def among_metal(self) -> bool:
@@ -156,18 +174,9 @@ class CoilResult(NamedTuple):
 
 
 def track_coil(frame: CoilFrame, followed: coil_step.Followed) -> CoilResult:
-    """Estimate a sensor's pose from one frame's fluxes, near where it was expected or anywhere."""
+    """Estimate the pose of a sensor that is not good where it was expected, there or anywhere."""
     context, settings, row = frame.context, frame.settings, frame.row
     scans, fault = frame.tracks.scans[row], followed.fault[row]
-    if fault == SOUND:
-        scans.forget()
-        solution = followed.solution(row)
-        estimate = PoseEstimate(
-            frame.name, frame.stamp_ns, states.OK, solution.position, solution.axis, None,
-            followed.covariance[row], float(followed.residual_t[row]),
-            solution.chi2 / frame.freedom.of_residual, context.model_id, '', frame.freedom.checks,
-        )  # fmt: skip
-        return CoilResult(estimate, solution, False, frame.among_metal)
     if fault != coil_step.UNKNOWN:
         solution = followed.solution(row)
         return CoilResult(_judge(frame, solution, []), solution, False, frame.among_metal)

@@ -252,17 +252,20 @@ class Judgement:
 
 def _place_of(estimate: PoseEstimate) -> Place:
     """Return the place of an estimate, with what turns about it; no roll of a single coil does."""
-    turns, covariance = estimate.rotation, estimate.covariance
-    tilt = covariance[3, 3] + covariance[4, 4] + covariance[5, 5]
-    if turns is None:
-        turns = estimate.axis
-        tilt -= turns @ covariance[3:, 3:] @ turns
-        arm = ARM_M
+    known = estimate.covariance.tolist()
+    tilt = known[3][3] + known[4][4] + known[5][5]
+    if estimate.rotation is None:
+        arm, turns = ARM_M, estimate.axis.tolist()
+        for x, row in zip(turns, known[3:], strict=True):
+            tilt -= x * (row[3] * turns[0] + row[4] * turns[1] + row[5] * turns[2])
     else:
-        arm = ARM_M / math.sqrt(2.0)  # of three axes two turn
-    where = [*estimate.position.tolist(), *(arm * turns).ravel().tolist()]
-    sigma_m = math.hypot(estimate.sigma_position_m, ARM_M * math.sqrt(max(tilt, 0.0)))
-    return Place(estimate.stamp_ns, where, sigma_m)
+        arm, turns = (
+            ARM_M / math.sqrt(2.0),
+            estimate.rotation.ravel().tolist(),
+        )  # two of three turn
+    where = [*estimate.position.tolist(), *[arm * one for one in turns]]
+    square = known[0][0] + known[1][1] + known[2][2] + ARM_M**2 * max(tilt, 0.0)
+    return Place(estimate.stamp_ns, where, math.sqrt(square))
 
 
 def _add_gain_error(

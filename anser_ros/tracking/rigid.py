@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from anser_ros.arrays import Array
 from anser_ros.errors import TrackingError
 from anser_ros.kernel_cache import inlined, kernel
-from anser_ros.physics.dipole import dipole_field, fill_coil_basis
+from anser_ros.physics.dipole import dipole_field, fill_coil_basis, fill_flux_basis
 from anser_ros.physics.rotations import nearest_rotation
 from anser_ros.tracking.descent import (
     CONVERGED_CHI2,
@@ -28,7 +29,13 @@ from anser_ros.tracking.descent import (
     limit_step,
 )
 from anser_ros.tracking.seed import SeedGrid
-from anser_ros.tracking.solve import COMMON_GAIN, GAIN_CHANGES, LEAST_GAIN, RealField
+from anser_ros.tracking.solve import (
+    COMMON_GAIN,
+    GAIN_CHANGES,
+    LEAST_GAIN,
+    RealField,
+    bounded_inverse,
+)
 
 
 @inlined
@@ -72,6 +79,30 @@ def _look(  # type: ignore[no-untyped-def]
 
 
 @inlined
+def _turned(x, y, z, rotation, new_rotation):  # type: ignore[no-untyped-def]
+    """Write a rotation that is turned by a vector besides, rad, in fg."""
+    square, vector, turn = x * x + y * y + z * z, np.empty(3), np.empty((3, 3))
+    vector[0], vector[1], vector[2] = x, y, z
+    angle = math.sqrt(square)
+    if angle < 1e-4:
+        a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
+    else:
+        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / square
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        turn[i, i] = 1.0 - b * (vector[j] * vector[j] + vector[k] * vector[k])
+        both = b * vector[i] * vector[j]
+        turn[i, j], turn[j, i] = both - a * vector[k], both + a * vector[k]
+    new = np.dot(turn, rotation)
+    square_of_new = np.dot(new, new.T)
+    rounded = np.dot(square_of_new, new)
+    for i in range(3):
+        for j in range(3):
+            # One step towards the nearest rotation takes off what rounding has added.
+            new_rotation[i, j] = 1.5 * new[i, j] - 0.5 * rounded[i, j]
+
+
+@inlined
 def _advance(  # type: ignore[no-untyped-def]
     position, rotation, information, gradient, step, low, high, new_position, new_rotation
 ):  # fmt: skip
@@ -87,25 +118,7 @@ def _advance(  # type: ignore[no-untyped-def]
         promised += step[i] * (2.0 * gradient[i] - row)
     for i in range(3):
         new_position[i] = min(max(position[i] + step[i], low[i]), high[i])
-    square = step[3] ** 2 + step[4] ** 2 + step[5] ** 2
-    angle = math.sqrt(square)
-    if angle < 1e-4:
-        a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
-    else:
-        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / square
-    turn = np.empty((3, 3))
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        x, y, z = step[3 + i], step[3 + j], step[3 + k]
-        turn[i, i] = 1.0 - b * (y * y + z * z)
-        turn[i, j], turn[j, i] = b * x * y - a * z, b * x * y + a * z
-    new = np.dot(turn, rotation)
-    square_of_new = np.dot(new, new.T)
-    rounded = np.dot(square_of_new, new)
-    for i in range(3):
-        for j in range(3):
-            # One step towards the nearest rotation takes off what rounding has added.
-            new_rotation[i, j] = 1.5 * new[i, j] - 0.5 * rounded[i, j]
+    _turned(step[3], step[4], step[5], rotation, new_rotation)
     return promised
 
 
@@ -165,6 +178,19 @@ def descend_body(  # type: ignore[no-untyped-def]
             converged, place = True, trial[:2]
             break
     return chi2, converged, place[0], place[1], pose[2], pose[3], pose[4]
+
+
+@kernel
+def carried_on(position, rotation, old_position, old_rotation, steps):  # type: ignore[no-untyped-def]
+    """Return position and rotation after so many more steps like that from the old ones."""
+    moved, turn, turned = np.empty(3), np.dot(rotation, old_rotation.T), np.empty((3, 3))
+    x, y, z = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
+    sine, cosine = math.sqrt(x * x + y * y + z * z), turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0
+    part = steps * math.atan2(sine, cosine) / sine if sine > 0.0 else 0.0
+    for i in range(3):
+        moved[i] = position[i] + steps * (position[i] - old_position[i])
+    _turned(part * x, part * y, part * z, rotation, turned)
+    return moved, turned
 
 
 @kernel
@@ -242,6 +268,11 @@ class BodyCoils:
         """Return the largest distance of a coil from the tool's origin, m."""
         return float(np.linalg.norm(self.offsets, axis=1).max())
 
+    @cached_property
+    def middle(self) -> Array:
+        """Return the mean of the offsets, (3,), m."""
+        return np.asarray(self.offsets.mean(axis=0))
+
     def subset(self, keep: NDArray[np.generic]) -> 'BodyCoils':
         """Return the coils of a mask or of ascending indices; all of them are these coils
         themselves.
@@ -255,63 +286,66 @@ class BodyCoils:
             None if self.changes is None else np.ascontiguousarray(self.changes[:, keep]),
         )
 
-    def gain_errors(self, flux: Array) -> Array:
-        """Return what the changes of gains make of fluxes (S, 2K): (S, G, 2K), T."""
-        if self.changes is None:
-            return np.zeros((len(flux), 0, flux.shape[1]))
-        return np.ascontiguousarray(self.changes.T[:, :, None] * flux[:, None, :])
+    @cached_property
+    def gain_changes(self) -> Array:
+        """Return ``changes``, (0, S) where there are none."""
+        return np.empty((0, len(self.axes))) if self.changes is None else self.changes
 
 
-@dataclass(frozen=True)
-class BodySolution:
-    """States where a rigid tool's solve ended."""
+class BodySolution(NamedTuple):
+    """States where a rigid tool's solve ended, and how well that is known."""
 
     position: Array  # (3,), body origin, m, frame fg
     rotation: Array  # (3, 3), takes body vectors to fg
     chi2: float  # Squared residual in units of its covariance
     information: Array  # (6, 6), inverse covariance of (position, rotation vector), both in fg
     residual: Array  # (S, 2K), measured minus modelled flux, T
-    coil_chi2: Array  # (S,), each coil's squared residual in units of its own noise
     converged: bool
-    # (8, S 2K), whitened: residual, derivatives as in `_look`, flux; and `common_factor`
+    # (8, S 2K), whitened: residual, derivatives as in `_look`, flux
     rows: Array
-    common: Array
-
-    @property
-    def whitened(self) -> Array:
-        """Return the residuals without what coils share, (S 2K,): noise of one each."""
-        white = self.rows[0]
-        return np.asarray(white - (self.common @ white) @ self.common)
-
-    def gain(self, covariance: Array) -> tuple[float, Array]:
-        """Return what a gain of all coils may be off by, and what a gain does to the pose (6,).
-
-        The first is the root of the mean square of its posterior beyond `LEAST_GAIN`: it has
-        changed with a probability of `GAIN_CHANGES`, then by `COMMON_GAIN`. The second is in m
-        and rad, ``covariance`` (6, 6) the pose's.
-        """
-        shared = self.rows @ self.common.T
-        products = self.rows @ self.rows.T - shared @ shared.T
-        carried = covariance @ products[1:7]
-        information = products[7, 7] - products[7, 1:7] @ carried[:, 7]
-        score = float(products[7, 0] - products[7, 1:7] @ carried[:, 0])
-        variance = 1.0 / (max(float(information), 0.0) + COMMON_GAIN**-2)
-        odds = GAIN_CHANGES / (1.0 - GAIN_CHANGES) * math.sqrt(variance) / COMMON_GAIN
-        changed = 1.0 / (1.0 + math.exp(-0.5 * variance * score**2) / odds)
-        square = changed * ((variance * score) ** 2 + variance) - LEAST_GAIN**2
-        return math.sqrt(max(square, 0.0)), carried[:, 7]
+    coil_chi2: Array  # (S,), each coil's squared residual in units of its own noise
+    whitened: Array  # (S 2K,), residuals without what coils share: noise of one each
+    covariance: Array  # (6, 6), of position and rotation vector, see `bounded_inverse`
+    # What a gain of all coils may be off by, and what a gain does to the pose (6,), m and rad
+    gain: float
+    carried: Array
 
 
 @kernel
-def _common(modes, inverse_sigma, out):  # type: ignore[no-untyped-def]
-    """Write what `common_factor` returns; False where the modes are not finite."""
-    coils, count, width = modes.shape
-    for s in range(coils):
-        for r in range(count):
-            for k in range(width):
-                out[r, s * width + k] = modes[s, r, k] * inverse_sigma[k]
+def weigh(rows, common, information, coils):  # type: ignore[no-untyped-def]
+    """Return the last five items of `BodySolution`, of so many coils.
+
+    ``common`` is from `common_factor`. What the gain may be off by is the root of the mean square
+    of its posterior beyond `LEAST_GAIN`: it has changed with a probability of `GAIN_CHANGES`, then
+    by `COMMON_GAIN`.
+    """
+    shared = np.dot(rows, common.T)
+    products = np.dot(rows, rows.T) - np.dot(shared, shared.T)
+    whitened, coil_chi2 = rows[0] - np.dot(shared[0], common), np.zeros(coils)
+    width = rows.shape[1] // coils
+    for i in range(rows.shape[1]):
+        coil_chi2[i // width] += rows[0, i] ** 2
+    covariance, carried = bounded_inverse(information), np.zeros(6)
+    told, score = products[7, 7], products[7, 0]
+    for i in range(6):
+        for j in range(6):
+            carried[i] += covariance[i, j] * products[1 + j, 7]
+    for i in range(6):
+        told -= products[7, 1 + i] * carried[i]
+        for j in range(6):
+            score -= products[7, 1 + i] * covariance[i, j] * products[1 + j, 0]
+    variance = 1.0 / (max(told, 0.0) + COMMON_GAIN**-2)
+    odds = GAIN_CHANGES / (1.0 - GAIN_CHANGES) * math.sqrt(variance) / COMMON_GAIN
+    changed = 1.0 / (1.0 + math.exp(-0.5 * variance * score**2) / odds)
+    square = changed * ((variance * score) ** 2 + variance) - LEAST_GAIN**2
+    return coil_chi2, whitened, covariance, math.sqrt(max(square, 0.0)), carried
+
+
+@kernel
+def _factor(out):  # type: ignore[no-untyped-def]
+    """Turn modes D (R, n) into E, see `common_factor`; return False where they are not finite."""
     factor = np.dot(out, out.T)
-    for i in range(count):
+    for i in range(out.shape[0]):
         for j in range(i + 1):
             total = factor[i, j] + (i == j)
             for k in range(j):
@@ -327,14 +361,47 @@ def _common(modes, inverse_sigma, out):  # type: ignore[no-untyped-def]
     return True
 
 
+@kernel
+def fill_common(  # type: ignore[no-untyped-def]
+    position, rotation, offsets, axes, lengths, changes, flux, dipoles, modes, sigma, strengths,
+    out,
+):  # fmt: skip
+    """Write E, see `common_factor`, of a body at a pose: errors of the model's moments, of gains
+    that coils have in common, and of the emitters' strengths, in this order.
+
+    A body learns how far each mode goes from what its coils differ by: those of places 6 mm
+    aside, where a coil was before, make poses by a drawing wrong by 3.5 of their sigmas. The
+    arguments are those of `BodyCoils` and `fill_model_errors`, ``flux`` (S, 2K), T. Returns False
+    where an error is not finite.
+    """
+    coils, width = flux.shape
+    places, turned = np.dot(offsets, rotation.T), np.dot(axes, rotation.T)
+    places += position
+    basis, count = np.empty((coils, dipoles.shape[1])), modes.shape[1] // width
+    fill_flux_basis(places, turned, lengths, dipoles, basis)
+    made, gains = np.dot(basis, modes), count + changes.shape[0]
+    for s in range(coils):
+        for k in range(width):
+            column, weight = s * width + k, 1.0 / sigma[k]
+            for r in range(count):
+                out[r, column] = weight * made[s, r * width + k]
+            for r in range(changes.shape[0]):
+                out[count + r, column] = weight * changes[r, s] * flux[s, k]
+            real, other, sign = k - k % 2, k + 1 - 2 * (k % 2), 2.0 * (k % 2) - 1.0
+            for r in range(strengths.shape[1]):
+                a, b = strengths[real, r], sign * strengths[real + 1, r]
+                out[gains + r, column] = weight * (flux[s, k] * a + flux[s, other] * b)
+    return _factor(out)
+
+
 def common_factor(modes: Array, inverse_sigma: Array) -> Array:
     """Return E (R, S 2K) with ``(I + D^T D)^-1 = I - E^T E`` for whitened modes D.
 
     ``modes`` (S, R, 2K) are flux errors of one standard deviation each that several coils share,
     T; ``inverse_sigma`` (2K,) is in 1/T. Raises `TrackingError` when the modes are not finite.
     """
-    common = np.empty((modes.shape[1], len(modes) * inverse_sigma.size))
-    if not _common(modes, inverse_sigma, common):
+    common = np.concatenate(modes * inverse_sigma, axis=1)
+    if not _factor(common):
         raise TrackingError('the model covariance must be finite')
     return common
 
@@ -366,8 +433,8 @@ def solve_body(
         r, turn, coils.offsets, coils.axes, coils.lengths, flux, inverse_sigma, common,
         field.columns, field.moments, low, high, MAX_EVALUATIONS,
     )  # fmt: skip
-    coil_chi2 = (white[0].reshape(count, width) ** 2).sum(axis=1)
-    return BodySolution(r, turn, chi2, information, residual, coil_chi2, converged, white, common)
+    known = weigh(white, common, information, count)
+    return BodySolution(r, turn, chi2, information, residual, converged, white, *known)
 
 
 def start_from_coils(

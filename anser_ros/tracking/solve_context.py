@@ -102,13 +102,6 @@ def fill_model_errors(  # type: ignore[no-untyped-def]
     return True
 
 
-def strength_errors(flux: Array, strengths: Array) -> Array:
-    """Return what errors of emitters' strengths (2K, Q) make of fluxes (S, 2K): (S, Q, 2K), T."""
-    relative = np.ascontiguousarray(strengths.T).view(np.complex128)
-    values = np.ascontiguousarray(flux).view(np.complex128)
-    return (values[:, None, :] * relative).view(np.float64)
-
-
 def source_spacing(positions: Array, floor_m: float) -> Array:
     """Return how far dipoles where tools may be are from their neighbours, m, shape (N,).
 
@@ -309,8 +302,9 @@ class SolveContext:
         A constant field has no quadrature, and one whose phase is everywhere alike none besides.
         """
         flux = self.starts.landmarks(self.field)[1]
-        size = np.linalg.svd(flux[np.isfinite(flux).all(axis=1)], compute_uv=False)
-        return int((size > LEAST_READING * size[0]).sum())
+        flux = flux[np.isfinite(flux).all(axis=1)]
+        power = np.linalg.eigvalsh(flux.T @ flux)
+        return int((power > LEAST_READING**2 * power[-1]).sum())
 
     @cached_property
     def symmetry(self) -> SymmetryAxis | None:
@@ -345,18 +339,6 @@ class SolveContext:
     def make_ready(self) -> None:
         """Work out what a warm solve needs of the field and its uncertainty."""
         _ = self.readings, self.symmetry, self.arrays, self.middle
-
-    def errors_at(self, points: Array, axes: Array, lengths: Array) -> Array:
-        """Return flux errors (S, R, 2K), T, of coils at poses; see `fill_model_errors`.
-
-        A body learns how far each mode goes from what its coils differ by: those of places 6 mm
-        aside, where a coil was before, make poses by a drawing wrong by 3.5 of their sigmas.
-        """
-        of = self.arrays
-        basis = np.empty((len(points), of.uncertain.shape[1]))
-        fill_flux_basis(points, axes, lengths, of.uncertain, basis)
-        errors: Array = (basis @ of.modes).reshape(len(points), -1, self.sigma.size)
-        return errors
 
 
 def model_digest(model: FieldModel) -> str:

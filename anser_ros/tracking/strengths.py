@@ -19,7 +19,7 @@ from anser_ros.integrity.pose_checks import STREAM_GAP_S
 from anser_ros.kernel_cache import kernel
 from anser_ros.settings import EMITTER_STEADY_S, ToolSettings
 from anser_ros.stamps import NANO
-from anser_ros.tracking import body_track, coil_step, rigid
+from anser_ros.tracking import body_track, coil_step
 from anser_ros.tracking.body_track import BodyFit, BodyFrame
 from anser_ros.tracking.estimate import USUAL_GATE
 from anser_ros.tracking.solve import RealField
@@ -185,7 +185,7 @@ class EmitterStrengths:
         """
         solution, used = fit.solution, fit.used
         flux, start = frame.flux[used], (solution.position, solution.rotation)
-        weights, shared = frame.inverse_sigma, frame.shared(used, start)
+        common = frame.common(used, start, AS_THEY_ARE)
         if not fit.good(USUAL_GATE):
             known = self._covariance[: self._width, : self._width]
             unknown = frame.context.with_strengths(np.linalg.cholesky(known))
@@ -196,7 +196,7 @@ class EmitterStrengths:
             away -= self.used.view(np.float64)
         unknowns = (body_track if len(used) > 1 else coil_step).UNKNOWNS
         ratio: float = learn_strengths(
-            solution.rows, flux, weights, rigid.common_factor(shared, weights), away,
+            solution.rows, flux, frame.inverse_sigma, common, away,
             flux.size - unknowns, MOST_LEFT, self._mean, self._covariance,
         )  # fmt: skip
         return ratio <= MOST_LEFT

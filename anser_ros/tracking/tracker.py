@@ -31,6 +31,7 @@ from anser_ros.pose_states import Withheld
 from anser_ros.stamps import NANO
 from anser_ros.tracking import rigid
 from anser_ros.tracking.body_track import BodyFrame, BodyResult, BodyTrack, solve_with, track_body
+from anser_ros.tracking.coil_step import Followed
 from anser_ros.tracking.coil_track import CoilFrame, CoilResult, CoilTracks, track_coil
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.judgement import Judgement, RigidBody
@@ -42,6 +43,7 @@ from anser_ros.tracking.solve_context import (
     depends_on,
     without_dead,
 )
+from anser_ros.tracking.solve_verdict import SOUND
 from anser_ros.tracking.strengths import EmitterStrengths, Look
 
 
@@ -320,12 +322,14 @@ class Tracker:
     ) -> list[PoseEstimate]:  # fmt: skip
         """Return the poses of fluxes (S, K) whose readings are good or bad by ``codes`` (S,)."""
         values = flux.view(np.float64)
-        coils = self._solved_coils(stamp_ns, values, codes, context)
+        coils, ended = self._solved_coils(stamp_ns, values, codes, context)
         frames, bodies = [], []
         for name, (rows, table) in self._scene.bodies.items():
             single = [coils[i] for i in rows]
-            own = values[rows]
-            frame = BodyFrame(name, stamp_ns, own, context, self.settings, table, single)
+            own = ended.position[rows], ended.axis[rows], ended.normal[rows]
+            frame = BodyFrame(
+                name, stamp_ns, values[rows], context, self.settings, table, single, own
+            )
             frames.append(frame)
             if context.symmetry is not None:
                 reason = 'the field is the same all around its axis: a turn about it stays unknown'
@@ -366,29 +370,41 @@ class Tracker:
         for row, (estimate, found, _, among_metal, _) in enumerate(coils):
             if found is not None and row not in grouped and not among_metal:
                 one = rigid.BodyCoils.single(float(self._scene.table.length[row]))
-                own = values[row : row + 1]
-                frame = BodyFrame(estimate.name, stamp_ns, own, context, self.settings, one, [])
+                own = found.position[None], found.axis[None], found.normal[None]
+                frame = BodyFrame(
+                    estimate.name, stamp_ns, values[row : row + 1], context, self.settings, one,
+                    [], own,
+                )  # fmt: skip
                 turn = rotation_of_quaternion(np.array(quaternion_of_axis(found.axis)))
                 yield frame, solve_with(frame, np.zeros(1, np.int64), (found.position, turn))
 
     def _solved_coils(
         self, stamp_ns: int, values: Array, codes: Integers, context: SolveContext
-    ) -> list[CoilResult]:
+    ) -> tuple[list[CoilResult], Followed]:
+        """Return what is found of each coil, and where the solves of all ended."""
         table, past, settings, results = self._scene.table, self._past, self.settings, []
         tracks, lengths = past.coils, table.length.tolist()
-        followed = tracks.follow(stamp_ns, values, codes == GOOD, table.length, context, settings)
+        ended = tracks.follow(stamp_ns, values, codes == GOOD, table.length, context, settings)
+        freedom, said = tracks.freedom, ended.fault.tolist()
         for i, (name, code) in enumerate(zip(table.name, codes.tolist(), strict=True)):
+            if said[i] == SOUND:
+                results.append(tracks.followed(i, name, stamp_ns, ended, context.model_id))
+                continue
+            frame = CoilFrame(
+                name, stamp_ns, values[i], context, settings, lengths[i], i, tracks, freedom
+            )
             fault = FAULTS[code]
-            frame = CoilFrame(name, stamp_ns, values[i], context, settings, lengths[i], i, tracks)
             if fault is None:
-                result = track_coil(frame, followed)
+                result = track_coil(frame, ended)
                 past.counters['cold_starts'] += result.cold
             else:
                 past.counters[f'readings_{fault.kind}'] += 1
                 reason = past.freshness.reason(i) if code == STUCK_CODE else fault.reason
                 result = CoilResult(frame.no_pose(fault.state, reason), None)
+            if (one := result.solution) is not None:
+                ended.position[i], ended.axis[i], ended.normal[i] = one[0], one[1], one.normal
             results.append(result)
-        return results
+        return results, ended
 
     def _without_poses(
         self, frame: Frame, state: str, model_id: str, reason: str
@@ -440,9 +456,6 @@ def warm_up() -> None:
             # New noise each time, for a reading that repeats is no reading.
             noise = settings.flux_noise_t * rng.standard_normal((2, *flux.shape))
             tracker.update(stamp_ns, sensors.channel, flux + noise[0] + 1j * noise[1])
-        if uncertainty is not None:  # what a coil needs that is far from where it was expected
-            context = build_context(model, settings)
-            context.errors_at(places, sensors.axis, sensors.length)
 
 
 def warm_up_bodies(model: FieldModel) -> None:

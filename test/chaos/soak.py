@@ -6,7 +6,6 @@ which everything is used for the first time. A node that grows by more than is a
 
 import argparse
 import contextlib
-import os
 import sys
 import tempfile
 import time
@@ -29,15 +28,19 @@ HOUR_S = 3600.0
 
 @dataclass
 class Series:
-    """What was seen of one node: time (s), resident memory (MB), open files, threads."""
+    """What was seen of one node: time (s), its own memory (MB), open files, threads.
+
+    Pages of files (programs, compiled kernels) are not its own: the system takes idle ones away
+    and brings them back, which is no growth.
+    """
 
     rows: list[tuple[float, float, int, int]] = field(default_factory=list)
 
     def note(self, time_s: float, pid: int) -> None:
         """Look at the process."""
         process = Path(f'/proc/{pid}')
-        pages = int((process / 'statm').read_text().split()[1])
-        memory = pages * os.sysconf('SC_PAGE_SIZE') / 1e6
+        status = dict(line.split(':', 1) for line in (process / 'status').read_text().splitlines())
+        memory = sum(1.024e-3 * int(status[key].split()[0]) for key in ('RssAnon', 'VmSwap'))
         files = len(list((process / 'fd').iterdir()))
         threads = len(list((process / 'task').iterdir()))
         self.rows.append((time_s, memory, files, threads))

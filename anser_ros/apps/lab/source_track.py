@@ -162,7 +162,8 @@ class _SourceFrame(SolveFrame):
         part, context, used = self.coils.subset(self.used), self.context, self.used
         flux = np.ascontiguousarray(self.flux[np.ix_(used, self.live)])
         weights = 1.0 / context.sigma[self.live]
-        common = common_factor(part.gain_errors(flux), weights)
+        gains = part.gain_changes.T[:, :, None] * flux[:, None, :]
+        common = common_factor(np.ascontiguousarray(gains), weights)
         low, high = context.low - part.reach, context.high + part.reach
         return solve_body(self.field, part, flux, weights, common, *start, low, high)
 
