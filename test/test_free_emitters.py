@@ -12,7 +12,7 @@ from anser_ros.calibration.layouts import CLUSTER, FREE_KINDS, Generator, cluste
 from anser_ros.calibration.population import alike_sigma_m
 from anser_ros.calibration.result import residuals
 from anser_ros.calibration.selection import COAXIAL
-from anser_ros.calibration.sensor_parameters import KINDS, SensorParameters, has_turned
+from anser_ros.calibration.sensor_parameters import KINDS, SensorParameters, open_ways
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import ModelFileError
 from anser_ros.field.measurements import Measurements
@@ -166,6 +166,7 @@ def test_errors_that_places_share_are_told_from_jitter():
 def test_sessions_that_turn_about_one_axis_each_determine_a_lever_arm_together():
     rng = np.random.default_rng(7)
     whole = scan(rng, shapeless(rng), 60)
+    rests = replace(whole, rotation=np.tile(np.eye(3), (60, 1, 1)))
     about = [
         replace(
             whole,
@@ -173,11 +174,14 @@ def test_sessions_that_turn_about_one_axis_each_determine_a_lever_arm_together()
         )
         for axis in (X, Z)
     ]
-    assert not has_turned(about[:1]) and has_turned(about)
-    assert 'lever_arm' not in SensorParameters(about[:1], KINDS).kinds
-    assert 'lever_arm' in SensorParameters(about, KINDS).kinds
-    assert 'axes' in SensorParameters(about[:1], KINDS).kinds
-    rests = replace(whole, rotation=np.tile(np.eye(3), (60, 1, 1)))
+    np.testing.assert_allclose(np.abs(open_ways(about[:1])), [X], atol=1e-9)
+    assert not len(open_ways(about))
+    one, both = (SensorParameters(part, KINDS) for part in (about[:1], about))
+    held, free = (p.rule()[np.ix_(*[p.rows('lever_arm')] * 2)] for p in (one, both))
+    assert held.shape == free.shape == (3, 3) and not free.any() and 'axes' in one.kinds
+    # An arm along the axis of all turns is held, and none across it.
+    assert held[0, 0] > 1e17 and not held[1:, 1:].round().any()
+    assert 'lever_arm' not in SensorParameters([rests], KINDS).kinds
     kinds = [SensorParameters([m], KINDS).kinds for m in (rests, rests.sensors_only([0]))]
     assert ['axes' in own for own in kinds] == [True, False]
 

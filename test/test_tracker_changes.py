@@ -136,17 +136,22 @@ def test_a_shift_of_the_whole_field_is_in_every_sigma_and_refuses_no_pose(rng):
 def test_a_lever_arm_that_no_turn_told_counts_where_the_tool_is_turned_otherwise(rng):
     position, rotation = random_pose(rng)
     flux, half = fluxes(MODEL, TOOL, position, rotation, rng), np.diag([-1.0, -1.0, 1.0])
-    sigma = {}
-    for name, scanned in (('alike', rotation), ('turned', rotation @ half)):
-        model = replace(
-            MODEL, shift_sigma_m=5e-3, open_arms={'tool_a': OpenArm(4e-3, scanned)}
-        ).turned(np.eye(3), np.zeros(3))
+    sigma, about_z = {}, np.diag([0.5, 0.5, 1.0])  # the mean of turns about z alone
+    ways = ('alike', rotation), ('turned', rotation @ half), ('axis', rotation @ half @ about_z)
+    for name, scanned in ways:
+        arm = OpenArm(4e-3, scanned, 0.02)
+        model = replace(MODEL, shift_sigma_m=5e-3, open_arms={'tool_a': arm})
+        model = model.turned(np.eye(3), np.zeros(3))
         again = from_document(to_document(model))
         found = one_frame(Tracker(again, TOOL), flux, 10**12)
         sigma[name] = [found[one].sigma_position_m ** 2 for one in ('tool_a', TOOL.name[0])]
+        turned = model.shift_covariance('tool_a', rotation)[3:, 3:].trace()
+        assert turned == pytest.approx(2 * 0.04**2 if name == 'turned' else 0.0, abs=1e-9)
     # Beside the arm 3 mm are open along each axis; half a turn moves two of them by twice the arm.
     assert np.allclose(sigma['alike'], 27e-6, atol=1e-6)
     assert np.allclose(sigma['turned'], 27e-6 + 2 * 64e-6, atol=1e-6)
+    # An arm across the axis of all turns is known.
+    assert np.allclose(sigma['axis'], 27e-6, atol=1e-6)
 
 
 def test_the_gate_is_where_the_settings_say(rng):

@@ -34,7 +34,7 @@ from anser_ros.calibration.selection import (
     choose_layout,
     thin_frames,
 )
-from anser_ros.calibration.sensor_fit import SensorFitter
+from anser_ros.calibration.sensor_fit import SensorFit, SensorFitter
 from anser_ros.calibration.sensor_parameters import SURVEYED_M
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel, OpenArm
@@ -137,7 +137,7 @@ def fit_scan(
         noise_t=max(held_out.flux_noise_t, float(np.sqrt(missed))) if is_told else 0.0,
         error_share=held_out.error_share if is_told else 0.0,
         shift_sigma_m=0.0 if sensors is None else sensors.shift_sigma_m,
-        open_arms={} if sensors is None else _open_arms(posed, sensors.open_arm_m),
+        open_arms={} if sensors is None else _open_arms(posed, sensors),
         effects=scan.corrections,
         gaps=gaps_of(whole, damping, posed, held_out.gap_factor),
     )
@@ -157,10 +157,12 @@ def fit_scan(
     return with_provenance(calibration, names)
 
 
-def _open_arms(posed: Sequence[Measurements], sigma_m: float) -> dict[str, OpenArm]:
-    """Return how bodies stood whose lever arms stay open by so much, m along each axis."""
-    turns = {m.body: [n.rotation for n in posed if n.body == m.body] for m in posed if sigma_m}
-    return {b: OpenArm(sigma_m, np.concatenate(t).mean(axis=0)) for b, t in turns.items()}
+def _open_arms(posed: Sequence[Measurements], found: SensorFit) -> dict[str, OpenArm]:
+    """Return how bodies stood whose lever arms, and turns of all their axes, stay open."""
+    arm_m, width = found.open_arm_m, found.posterior.width[found.parameters.rows('axes')]
+    axes_rad = float(np.sqrt(np.sum(width**2) / max(2 * width.size, 1)))  # means of two tilts
+    turns = {m.body: [n.rotation for n in posed if n.body == m.body] for m in posed if arm_m}
+    return {b: OpenArm(arm_m, np.concatenate(t).mean(axis=0), axes_rad) for b, t in turns.items()}
 
 
 def _is_explained(scan: Scan) -> bool:

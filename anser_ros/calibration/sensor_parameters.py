@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.arrays import Array, ComplexArray, Integers
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.pose_track import PoseTrack
-from anser_ros.physics.rotations import tangents, tilted
+from anser_ros.physics.rotations import tangents, tilted, unturned
 from anser_ros.physics.sensor import SensorTable, clusters_of
 
 KINDS = (
@@ -59,9 +59,6 @@ of a tool measured with a ruler. All places that a coil is found at are wrong by
 AS_PLACES = 4.0
 """The same in widths of the places' population, where that is less: a tool whose coils are where
 its setup has them is one that was measured well. An assumption, not a result."""
-TURNED_RAD = 0.05
-"""Turn of a body, rad rms, about a second axis from which on it determines a lever arm: a
-millimetre is then 0.05 mm of movement. With 0.02 rad, an example was off by 1.3 mm."""
 BY_RULE = 1e-9
 """Standard deviation, relative or m, of what a rule sets: far below any spread, and above what
 rounding makes of it."""
@@ -119,17 +116,13 @@ class BodyErrors:
         return replace(out, track=track, position=position, rotation=rotation, has_pose=seen)
 
 
-def has_turned(measurements: Sequence[Measurements], axes: int = 2) -> bool:
-    """Return whether a body turned about so many axes; two, or a lever arm shifts the field.
+def open_ways(measurements: Sequence[Measurements]) -> Array:
+    """Return unit vectors of a body along which a lever arm shifts the field, as it hardly turned.
 
     ``measurements``: of the body, in all sessions: several that turn about one axis each will do.
     """
     rotation = np.concatenate([m.rotation[m.has_pose] for m in measurements])
-    if len(rotation) < 2:
-        return False
-    turns = Rotation.from_matrix(rotation[0].T @ rotation).as_rotvec()
-    about = np.linalg.svd(turns - turns.mean(axis=0), compute_uv=False) / np.sqrt(len(turns))
-    return bool(about[axes - 1] > TURNED_RAD)
+    return unturned(rotation.mean(axis=0)) if len(rotation) > 1 else np.eye(3)
 
 
 def velocity_of(measurements: Measurements) -> Array:
@@ -161,11 +154,15 @@ class SensorParameters:
         estimated = (
             set(kinds) if all(m.is_followed for m in measurements) else {*kinds} - {*CLOCKS}
         )
-        bodies = {m.body for m in measurements}
-        for own in ([m for m in measurements if m.body == body] for body in bodies):
-            estimated -= set() if has_turned(own) else {SHARED_SHIFT}
-            if is_free and len(own[0].sensors) == 1 and not has_turned(own, 1):
+        bodies = list(dict.fromkeys(m.body for m in measurements))
+        self.open_ways: dict[str, Array] = {}
+        for body in bodies:
+            own = [m for m in measurements if m.body == body]
+            ways = self.open_ways[body] = open_ways(own)
+            estimated -= {SHARED_SHIFT} if len(ways) == 3 else set()
+            if is_free and len(own[0].sensors) == 1 and len(ways) == 3:
                 estimated -= {'axes'}  # a tilt that all poses share is the field's too
+        self.is_open = any(len(ways) for ways in self.open_ways.values())
         if not self.omega.any():
             estimated -= {'delays'}
         # Of all bodies, and of each.
@@ -181,7 +178,7 @@ class SensorParameters:
         self.each = {**EACH, 'offsets': 2 * self.emitters}
         power = [np.mean(np.abs(m.flux[m.usable]) ** 2) for m in measurements if m.usable.any()]
         self.unit_t = float(np.sqrt(np.mean(power))) if power else 1.0
-        self.bodies = list(dict.fromkeys(m.body for m in measurements))
+        self.bodies = bodies
         tables = {m.body: m.sensors for m in measurements}
         self.tables: list[SensorTable] = [tables[body] for body in self.bodies]
         times = [m.time for m in measurements if len(m.time)]
@@ -256,6 +253,9 @@ class SensorParameters:
                 groups += list(np.arange(own.start, own.stop).reshape(-1, EACH[kind]).T)
         for rows in groups:
             out[np.ix_(rows, rows)] += 1.0 / (rows.size * BY_RULE**2)
+        for body, ways in self.open_ways.items():  # no arm along an axis of all turns
+            if (arm := self.slices.get((SHARED_SHIFT, body))) is not None:
+                out[arm, arm] += ways.T @ ways / BY_RULE**2
         return out
 
     def by_rule(self, values: Array) -> tuple[Array, float]:

@@ -20,6 +20,7 @@ from anser_ros.arrays import Array, ComplexArray, numbers_of
 from anser_ros.errors import ModelFileError
 from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.physics.dipole import dipole_field, flux_basis
+from anser_ros.physics.rotations import unturned
 from anser_ros.physics.sensor import along_each_axis
 
 
@@ -263,6 +264,7 @@ class OpenArm:
 
     sigma_m: float  # standard deviation of the arm along each axis, in the model's shift
     turn: Array  # (3, 3), mean of the rotation matrices of the scan, body to fg
+    axes_rad: float = 0.0  # standard deviation about each axis of a turn that all its coils share
 
 
 SCHEMA = 'anser_model/1'
@@ -357,7 +359,7 @@ class FieldModel:
                 self.flux_error_t, self.modes,
                 [[effect.name, plain(dict(effect.parameters))] for effect in self.effects],
                 *(value for value in (self.shift_sigma_m, self.noise_t) if value),
-                *(part for arm in self.open_arms.values() for part in (arm.sigma_m, arm.turn)),
+                *(part for arm in self.open_arms.values() for part in asdict(arm).values()),
             ]
         )  # fmt: skip
 
@@ -393,21 +395,25 @@ class FieldModel:
             place, direction = one.positions @ turn.T + shift, one.directions @ turn.T
             return replace(one, positions=place, directions=direction)
 
-        arms = {b: OpenArm(a.sigma_m, turn @ a.turn) for b, a in self.open_arms.items()}
+        arms = {b: replace(a, turn=turn @ a.turn) for b, a in self.open_arms.items()}
         whole: FieldModel = replace(stands(self), open_arms=arms)
         return whole if self.gaps is None else replace(whole, gaps=stands(self.gaps))
 
     def shift_covariance(self, body: str, rotation: Array | None) -> Array:
-        """Return the covariance (3, 3), m^2, of the shift of a body turned so, and of its coils.
+        """Return the covariance (6, 6), m and rad, that poses of a body turned so, and of its
+        coils, share.
 
-        An open lever arm's error has shifted the field as the scan had the body. A pose is off by
-        what the arm's error is now beside that: by nothing where the body is turned as it was.
+        An open lever arm's error has shifted the field as the scan had the body, and a turn of all
+        its coils has turned it, both along what the scan did not turn. A pose is off by what these
+        are now beside that: by nothing where the body is turned as it was.
         """
-        covariance, arm = self.shift_sigma_m**2 * np.eye(3), self.open_arms.get(body)
-        if arm is not None and rotation is not None:
-            away = arm.turn - rotation
-            covariance += arm.sigma_m**2 * (away @ away.T - np.eye(3))
-        return covariance
+        known, arm = np.diag([self.shift_sigma_m**2] * 3 + [0.0] * 3), self.open_arms.get(body)
+        if arm is None or rotation is None:
+            return known
+        away = (arm.turn - rotation) @ unturned(arm.turn).T
+        known[:3, :3] += arm.sigma_m**2 * (away @ away.T - np.eye(3))
+        known[3:, 3:] = arm.axes_rad**2 * away @ away.T
+        return known
 
     def with_dipoles(
         self, positions: Array, directions: Array, moments: ComplexArray
@@ -508,7 +514,11 @@ def from_document(document: Any) -> FieldModel:
         shift_sigma = float(document.get('shift_sigma_m', 0.0))
         noise, share = (float(document.get(key, 0.0)) for key in ('noise_t', 'error_share'))
         arms = {
-            str(body): OpenArm(float(arm['sigma_m']), np.array(arm['turn'], float).reshape(3, 3))
+            str(body): OpenArm(
+                float(arm['sigma_m']),
+                np.array(arm['turn'], float).reshape(3, 3),
+                float(arm.get('axes_rad', 0.0)),
+            )
             for body, arm in dict(document.get('open_arms') or {}).items()
         }
     except (KeyError, TypeError, ValueError) as error:

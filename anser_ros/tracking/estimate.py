@@ -148,8 +148,8 @@ class PoseEstimate:
         return math.sqrt(matrix[0, 0] + matrix[1, 1] + matrix[2, 2])
 
     def add_shift(self, covariance: Array) -> None:
-        """Add a shift's covariance (3, 3), m^2, to the estimate's, a matrix that is no other's."""
-        self.covariance[:3, :3] += covariance
+        """Add a shared error's covariance (6, 6) to the estimate's, which is no other's."""
+        self.covariance[:] += covariance
 
 
 def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) -> PoseEstimate:
