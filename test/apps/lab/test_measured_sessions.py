@@ -189,13 +189,13 @@ class TestIlemt:
     def test_the_real_data(self, tmp_path):
         bags = ilemt.write_sessions(SHARED / 'measured' / 'ilemt', tmp_path)
         assert bags[0].stem == 'ilemt_dipole_YoutZup_YoutZup_md'
-        assert len(bags) == 2 * (3 + 3 + 3 + 6) + 2 * 4 + 7
+        assert len(bags) == 2 * (3 + 3 + 3 + 6) + 2 * 4 + 8
         (tool,) = load_session(bags[0]).tools
         assert tool.flux.shape == (142, 3, 3) and tool.has_pose.all()
         (other,) = load_session(next(b for b in bags if 'turned_ZoutYup' in b.stem)).tools
         # The source's fixture turns: what was before it is beside it.
         turned = other.position.mean(axis=0) / np.linalg.norm(other.position.mean(axis=0))
         assert tool.position[:, 2].min() > 0.1 and abs(turned[2]) < 0.3
-        assert len(ilemt.commands(bags, tmp_path)) == 5 + 3 + 3 + 3 + 6 + 3 + 2 * 4 + 7
-        clean, done = (load_session(bags[k]).tools[0].flux for k in (3, -2))
+        assert len(ilemt.commands(bags, tmp_path)) == 5 + 3 + 3 + 3 + 6 + 3 + 2 * 4 + 8
+        clean, done = (load_session(bags[k]).tools[0].flux for k in (3, -3))
         np.testing.assert_allclose(np.angle(done / clean)[0, 0], [4e-3, -3e-3, 6e-3], atol=1e-9)

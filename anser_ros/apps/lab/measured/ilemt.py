@@ -55,10 +55,14 @@ ASKED = {
     'crossed': ('coil_phase', 'coil_phase', 'coil_polarity'), 'moved': ('registration',),
     'commanded': ('optical_scale',), 'fixture': ('body_turned',), 'gain': ('common_gain',),
     'both': ('coil_polarity', 'sensor_polarity'), 'phases': ('coil_phase',) * 3,
-    'step': ('coil_fluctuation',),
+    'step': ('coil_fluctuation',), 'shifted': ('registration',),
 }  # fmt: skip
 """Effects that have to be named, and no others: in the last files of sets, where the dipole's
-source was moved, and where its fine pattern is changed here."""
+source was moved or the concentric one's is not as in the other fixtures, and where the dipole's
+fine pattern is changed here."""
+OTHERS = {'moved': ('dipole', 'cal_9_1_premo_rotated_dipole', MD),
+          'shifted': ('concentric', 'cal_7_30_premo_cmu', LD)}  # fmt: skip
+"""Set whose model tells what happened, folder and pattern, where these are not the dipole's."""
 FACTORS = {  # of the readings, by sensor and emitter
     'reversed_md': np.array([[1.0], [1.0], [-1.0]]), 'gain': np.full((1, 1), 1.003),
     'both': np.outer([1.0, 1.0, -1.0], [-1.0, 1.0, 1.0]),
@@ -133,9 +137,9 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
             bag = into / f'{NAME}_{name}_{source}_{sensor}_{pattern.rpartition("_")[2]}.mcap'
             bags.append(_write(bag, file, setups[name], band, source, sensor))
     for name in (name for name in ASKED if name not in SETS):
-        where, pattern = ('cal_9_1_premo_rotated_dipole', MD) if name == 'moved' else (ROTATED, LD)
+        of, where, pattern = OTHERS.get(name, ('dipole', ROTATED, LD))
         file = folder / where / f'{pattern.format(HOME, HOME)}.npz'
-        bags.append(_write(into / f'{NAME}_{name}.mcap', file, setups['dipole'], 0, HOME, HOME))
+        bags.append(_write(into / f'{NAME}_{name}.mcap', file, setups[of], 0, HOME, HOME))
     return bags
 
 
@@ -156,11 +160,11 @@ def commands(bags: list[Path], out: Path) -> list[list[str]]:
         made.append(['calibrate', *map(str, learnt), '--out', model])
         verb = 'diagnose' if name in ASKED else 'evaluate'
         made += [[verb, str(b), '--model', model, '--out', str(out / b.stem)] for b in tracked]
-    model = str(out / 'dipole.yaml')
-    told = [b for b in bags if b.stem.partition('_')[2] in ASKED]
-    return made + [
-        ['diagnose', str(b), '--model', model, '--out', str(out / b.stem)] for b in told
-    ]
+    for bag in (bag for bag in bags if bag.stem.partition('_')[2] in ASKED):
+        of, *_ = OTHERS.get(bag.stem.partition('_')[2], ('dipole',))
+        known = out / f'{of}.yaml'
+        made.append(['diagnose', str(bag), '--model', str(known), '--out', str(out / bag.stem)])
+    return made
 
 
 def rows(folder: Path, bags: list[Path], out: Path) -> list[recipe.ReportRow]:
@@ -180,12 +184,16 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[recipe.ReportRow]:
             found.append(recipe.ReportRow(NAME, words, nan, value, unit, note, special=theirs))
     for name, asked in ASKED.items():
         bag = [bag for bag in bags if bag.stem.split('_')[1] == name][-1]
-        effects = recipe.ran(out / bag.stem, 'diagnosis.json')['effects']
-        named = Counter(effect['name'] for effect in effects)
+        told = recipe.ran(out / bag.stem, 'diagnosis.json')
+        named = Counter(effect['name'] for effect in told['effects'])
         wrong = (named - Counter(asked)).total() + (Counter(asked) - named).total()
         words = f'{name}: {", ".join(named.elements()) or "nothing"}: names missing or too many'
         note = f'asked: {", ".join(asked) or "nothing"}'
         found.append(recipe.ReportRow(NAME, words, nan, wrong, '', note, 0.0, wrong == 0))
+        words, keys = f'{name}: position rmse, held out', ('before', 'after')
+        both = (recipe.figure(told, 'held_out', f'position_rmse_{key}_m') for key in keys)
+        before, after = (1e3 * value for value in both)
+        found.append(recipe.ReportRow(NAME, words, before, after, 'mm', 'the other blocks'))
     return found
 
 
