@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.apps.poses import start
 from anser_ros.apps.poses.convention import read_rightly
 from anser_ros.apps.poses.effect import PoseTerm, PoseView, Role, pose_effects
-from anser_ros.apps.poses.effects.episodes import episode, in_episode, windows_of
+from anser_ros.apps.poses.effects.episodes import in_episode, is_passed
 from anser_ros.apps.poses.fit import (
     PoseFit,
     fit_poses,
@@ -385,11 +385,9 @@ def _outside_episodes(
     if len(rest) < len(plain.terms):
         plain = with_noise(fit_poses(problem, rest))
     residuals = _residuals(session, problem, plain)
-    off = {w for one in residuals.sensors for w in episode(one, residuals).windows}
-    if not off:
+    inside = [is_passed(one, residuals) for one in residuals.sensors]
+    if not any(mask.any() for mask in inside):
         return search
-    # What one sensor passes is near the others on its body.
-    inside = [np.isin(windows_of(one, residuals), list(off)) for one in residuals.sensors]
     cut = plain.state.problem.rows([~mask for mask in inside])
     again = search_effects(fit_poses(cut, frame_terms(rest)), session, say)
     return again if again.knows_levers else search

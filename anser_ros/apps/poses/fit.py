@@ -244,30 +244,29 @@ def noise_of(part: PosePart, with_stamps: bool = True) -> tuple[PoseNoise, float
     residual, velocity = part.residual[used], part.view.velocity[used]
     if not len(residual):
         return part.noise, 0.0
-    squares = np.mean(residual**2, axis=0)
-    own = squares[:3].sum(), squares[3:].sum()
-    start = [max(np.sqrt(s / 3), low) for s, low in zip(own, SMALLEST_NOISE, strict=True)]
-    moved = velocity * residual
-    moved_m, moved_rad = moved[:, :3].sum(axis=1), moved[:, 3:].sum(axis=1)
-    speed_m, speed_rad = (np.sum(part**2, axis=1) for part in np.split(velocity, 2, axis=1))
+    own, speed, moved = (
+        values.reshape(-1, 2, 3).sum(axis=2).T
+        for values in (np.mean(residual**2, axis=0), velocity**2, velocity * residual)
+    )
+    start = np.maximum(np.sqrt(own[:, 0] / 3), SMALLEST_NOISE)
+    if not with_stamps:  # the mean squares are the likeliest
+        cost = float(own[:, 0] @ start**-2 + 6 * np.log(start).sum())
+        return PoseNoise(float(start[0]), float(start[1])), cost * len(residual)
 
-    def cost(log: Array) -> float:
+    def cost_and_slopes(log: Array) -> tuple[float, Array]:
         """Sum of the whitened squares (`PoseNoise.whitened`) and of the spreads' logarithms."""
         log = np.clip(log, -FARTHEST_LOG, FARTHEST_LOG)
-        place, turn = np.exp(-2 * log[0]), np.exp(-2 * log[1])
-        fixed = own[0] * place + own[1] * turn + 6 * log[0] + 6 * log[1]
-        if not with_stamps:
-            return float(fixed)
-        stamp = np.exp(2 * log[2])
-        along = stamp * (speed_m * place + speed_rad * turn)
-        less = stamp * (moved_m * place + moved_rad * turn) ** 2 / (1 + along)
-        return float(fixed - less.mean() + np.log1p(along).mean())
+        weight, stamp = np.exp(-2 * log[:2]), np.exp(2 * log[2])
+        along, off = stamp * (weight @ speed), weight @ moved
+        share = stamp / (1 + along)
+        fixed = weight @ own[:, 0] + 6 * log[:2].sum()
+        value = fixed + np.mean(np.log1p(along) - share * off**2)
+        slopes = np.mean(share * (1 + share * off**2) * speed - 2 * share * off * moved, axis=1)
+        last = 2 * np.mean(along / (1 + along) - share**2 * off**2 / stamp)
+        return float(value), np.r_[6 - 2 * weight * (own[:, 0] + slopes), last]
 
-    if not with_stamps:  # the mean squares are the likeliest
-        plain = PoseNoise(float(start[0]), float(start[1]))
-        return plain, cost(np.log(start)) * len(residual)
-    tries = [np.log([start[0], start[1], stamp]) for stamp in (0.002, 0.02)]
-    found = [minimize(cost, at, method='BFGS') for at in tries]
+    tries = [np.log([*start, stamp]) for stamp in (0.002, 0.02)]
+    found = [minimize(cost_and_slopes, at, method='BFGS', jac=True) for at in tries]
     best = min(found, key=lambda result: float(result.fun))
     values = np.exp(best.x)
     stamp = min(float(values[2]), LARGEST_STAMP_S)

@@ -218,7 +218,7 @@ def _table(path: Path, unit: str | None) -> dict[str, RawRows]:
             lines = np.column_stack([time[here], np.full(here.sum(), np.nan), pose[here]])
             called = '_'.join(filter(None, (name, body))) if name or len(bodies) > 1 else path.stem
             rows[called] = RawRows(lines.tolist(), unit=columns.unit or stated)
-            if unit and rows[called].unit not in (unit, ''):
+            if unit and table.has_names and rows[called].unit not in (unit, ''):
                 raise ParameterError(f'{path}: its header says {rows[called].unit}, --unit {unit}')
     return rows
 

@@ -313,7 +313,7 @@ class OpticalPath:
         time, place, turn = track.time[apart], track.position[apart], track.quaternion[apart]
         if time.size < FEWEST_PATH_POSES:
             raise DiagnosisError(
-                f'the reference has {time.size} different poses, a path needs {FEWEST_PATH_POSES}'
+                f'fewer than {FEWEST_PATH_POSES} poses of the reference differ: is it at rest?'
             )
         flips = np.sign(np.einsum('ij,ij->i', turn[1:], turn[:-1]))
         turn[1:] *= np.cumprod(np.where(flips < 0, -1.0, 1.0))[:, None]

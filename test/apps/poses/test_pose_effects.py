@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.apps.poses.cli.pose_session import sizes
 from anser_ros.apps.poses.diagnosis import depends_on
 from anser_ros.apps.poses.effect import PoseSetting, Role, pose_effects
-from anser_ros.apps.poses.effects.episodes import PoseMovingMetal
+from anser_ros.apps.poses.effects.episodes import LooseMount, PoseMovingMetal
 from anser_ros.apps.poses.effects.field_distortion import FieldDistortion
 from anser_ros.apps.poses.effects.frames import PoseClockRate
 from anser_ros.apps.poses.effects.stream import ReceiptJitter, power_law, stamp_step, sudden_poses
@@ -178,15 +178,43 @@ def test_metal_at_one_sensor_leaves_the_episodes_of_others_at_other_times():
     assert times == pytest.approx([4.0, 8.0, 30.0], abs=1.0)
 
 
-def episodes_of(spans, *, returns=False, shared_m=0.0):
+def test_a_long_error_of_a_slow_tracker_is_an_episode_though_no_place_is_visited_twice():
+    (record,) = episodes_of(((30, 40, (4e-3, 4e-3, 4e-3)),), returns=True, wide_m=0.2)
+    assert record.parameters['t_start_s'] == pytest.approx(30.0, abs=1.1)
+    assert not episodes_of(((30, 40, (4e-3, 4e-3, 4e-3)),))  # it may be the place
+
+
+@pytest.mark.parametrize(('is_of_place', 'named'), [(False, ['sensor_0']), (True, [])])
+def test_what_comes_again_at_a_place_is_no_loose_mount(is_of_place, named):
+    rng, time = np.random.default_rng(6), np.arange(0, 60, 0.1)
+    place = 0.06 * np.sin(np.outer(time, [0.21, 0.17, 0.13]))
+    sensors = []
+    for k in range(2):
+        residual = 3e-4 * rng.normal(size=(time.size, 6))
+        course = place[:, 0] / 0.06 if is_of_place else np.sin(0.43 * time)
+        residual[:, 0] += (4e-3 if k == 0 else 0.0) * course
+        every, same = np.ones(time.size, dtype=bool), np.tile(np.eye(3), (time.size, 1, 1))
+        view = SimpleNamespace(
+            sensor=f'sensor_{k}', time=time, measured=place, velocity=np.zeros((time.size, 6)),
+            frame=np.eye(3), turn=same,
+        )  # fmt: skip
+        noise = PoseNoise(3e-4, 3e-4)
+        sensors.append(Plain(view=view, residual=residual, noise=noise, used=every, out=~every))
+    setting = PoseSetting(('sensor_0', 'sensor_1'), 0.0, 60.0, np.zeros(3), 0.1)
+    records = LooseMount().observed(Plain(sensors=sensors, setting=setting))
+    assert [r.parameters['sensor'] for r in records] == named
+
+
+def episodes_of(spans, *, returns=False, shared_m=0.0, wide_m=0.0):
     """Moving metal of three sensors that are off by so much in some spans of 40 s.
 
     A body that ``returns`` is at each place again, and the metal is not. All sensors are off by
-    ``shared_m`` in common.
+    ``shared_m`` in common. The body may be anywhere within ``wide_m`` each second.
     """
     rng, time = np.random.default_rng(5), np.arange(0, 40, 0.1)
     depth = 0.03 * np.sin(2 * time) if returns else 0.01 * time
     place = np.column_stack([0 * time, 0 * time, -depth])
+    place += wide_m * np.repeat(rng.uniform(-1, 1, (40, 3)), 10, axis=0)
     shared = shared_m * np.repeat(rng.normal(size=(time.size // 5, 6)), 5, axis=0)
     sensors = []
     for k in range(3):

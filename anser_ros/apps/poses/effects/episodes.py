@@ -146,7 +146,9 @@ def _episode(sensing: Sensing, residuals: PoseResiduals, is_beside: bool) -> Epi
         is_other = _lasts(runs, count) and _spread(place[inside]) > 0.5 * _spread(place)
     else:
         outside = (window >= 0) & ~inside & ~is_off
-        is_other = bool(outside.any()) and _is_revisited(place[inside], place[outside])
+        # A slow tracker comes near no place again.
+        near = _nearest_later(place[inside], window[inside]) if _lasts(runs, count) else NEAR_M
+        is_other = bool(outside.any()) and _is_revisited(place[inside], place[outside], near)
     return Episode(tuple(runs)) if is_other else Episode()
 
 
@@ -192,10 +194,27 @@ def in_episode(sensing: Sensing, residuals: PoseResiduals) -> Booleans:
     return np.asarray(np.isin(windows_of(sensing, residuals), inside))
 
 
-def _is_revisited(inside: Array, outside: Array) -> bool:
-    """Whether most places (n, 3) of an episode are near some (m, 3) outside it."""
+def is_passed(sensing: Sensing, residuals: PoseResiduals) -> Booleans:
+    """Return the mask (n,) of a sensor's poses while any sensor on its body is in an episode.
+
+    What one sensor passes is near the others.
+    """
+    windows = {w for one in residuals.sensors for w in episode(one, residuals).windows}
+    return np.asarray(np.isin(windows_of(sensing, residuals), list(windows)))
+
+
+def _nearest_later(place: Array, window: Integers) -> Array:
+    """Distance (n,), m, of places (n, 3) from the nearest at another time; `NEAR_M` at least."""
+    away = np.linalg.norm(place[:, None] - place, axis=2)
+    away[np.abs(window[:, None] - window) <= NEIGHBOURS] = np.inf
+    least = away.min(axis=1)
+    return np.where(np.isfinite(least), np.maximum(least, NEAR_M), NEAR_M)
+
+
+def _is_revisited(inside: Array, outside: Array, near: Array | float) -> bool:
+    """Whether most places (n, 3) of an episode are nearer than ``near``, m, to some outside it."""
     distance, _ = cKDTree(outside).query(inside)
-    return bool(np.mean(distance < NEAR_M) > REVISITED_SHARE)
+    return bool(np.mean(distance < near) > REVISITED_SHARE)
 
 
 def _middles(
@@ -226,11 +245,8 @@ def _is_alone(sensing: Sensing, residuals: PoseResiduals, runs: list[int]) -> bo
 
 def _is_shift(sensing: Sensing, inside: Booleans) -> bool:
     """Whether poses are off or turned the same way, as metal makes them, and not at random."""
-    for rows in np.split(sensing.residual[inside], 2, axis=1):
-        mean = rows.mean(axis=0)
-        if mean @ mean > ALIKE * np.mean(np.sum(rows**2, axis=1)):
-            return True
-    return False
+    errors = sensing.residual[inside]
+    return bool(np.any(_halves(errors.mean(axis=0)) > ALIKE * _halves(errors).mean(axis=0)))
 
 
 class PoseMovingMetal(PoseEffect):
@@ -323,50 +339,48 @@ class LooseMount(PoseEffect):
         """Return the sensor whose shifts are its own; a single sensor's could be anything else."""
         if len(residuals.sensors) < 2:
             return []
-        passed = [w for s in residuals.sensors for w in episode(s, residuals).windows]
-        shifts = {s.view.sensor: _shifts(s, residuals, passed) for s in residuals.sensors}
+        shifts = {s.view.sensor: _shifts(s, residuals) for s in residuals.sensors}
         found = []
         for sensing in residuals.sensors:
             name = sensing.view.sensor
             share, place, turn = shifts[name]
             others = [shifts[other][0] * shifts[other][1] for other in shifts if other != name]
             is_alone = share >= LOOSE and max(others) <= FAST * share * place
-            if not is_alone or episode(sensing, residuals).windows:
+            passes = episode(sensing, residuals).windows
+            if not is_alone or passes or _follows_place(sensing, residuals):
                 continue
             values = {'sensor': name, 'rms_m': place, 'rms_deg': float(np.rad2deg(turn))}
             found.append(EffectRecord(self.name, values, {'rms_m': 0.15 * place}))
         return found
 
 
-def _shifts(
-    sensing: Sensing, residuals: PoseResiduals, passed: Sequence[int]
-) -> tuple[float, float, float]:
+def _follows_place(sensing: Sensing, residuals: PoseResiduals) -> bool:
+    """Whether errors come again at the same place at other times, as no mount's do."""
+    window, used = windows_of(sensing, residuals)[sensing.used], sensing.used
+    pairs = cKDTree(sensing.view.measured[used]).query_pairs(NEAR_M, output_type='ndarray')
+    pairs = pairs[np.abs(np.subtract(*window[pairs].T)) > NEIGHBOURS]
+    one, other = (sensing.residual[used, :3][pairs[:, k]] for k in (0, 1))
+    return bool(np.sum(one * other) > LOOSE * 0.5 * np.sum(one**2 + other**2)) and len(pairs) > 0
+
+
+def _shifts(sensing: Sensing, residuals: PoseResiduals) -> tuple[float, float, float]:
     """Share of squared error that windows' means in the body's frame explain; rms, m, rad.
 
-    Without the windows that are ``passed``, in which something is near a sensor.
+    Without the windows in which something is near a sensor.
     """
     window = windows_of(sensing, residuals)
     back = (sensing.view.frame @ sensing.view.turn).transpose(0, 2, 1)
-    body = np.concatenate(
-        [np.einsum('nij,nj->ni', back, sensing.residual[:, k : k + 3]) for k in (0, 3)], axis=1
-    )
-    explained, total, count, means = 0.0, 0.0, 0, []
-    for number in np.setdiff1d(window[window >= 0], passed):
-        rows = body[(window == number) & sensing.used]
-        if len(rows) < FEWEST_POSES_OF_WINDOW:
-            continue
-        mean = rows.mean(axis=0)
-        means.append(mean)
-        explained += len(rows) * float(np.sum(mean[:3] ** 2))
-        total += float(np.sum(rows[:, :3] ** 2))
-        count += len(rows)
-    if count < window_count(residuals):
+    body = np.einsum('nij,nkj->nki', back, sensing.residual.reshape(-1, 2, 3)).reshape(-1, 6)
+    numbers = np.unique(window[(window >= 0) & ~is_passed(sensing, residuals)])
+    groups = [body[(window == number) & sensing.used] for number in numbers]
+    groups = [rows for rows in groups if len(rows) >= FEWEST_POSES_OF_WINDOW]
+    sizes = np.array([len(rows) for rows in groups])
+    if sizes.sum() < window_count(residuals):
         return 0.0, 0.0, 0.0
-    values = np.array(means)
-    share = explained / max(total, 1e-18) - len(means) / count
-    place, turn = (
-        float(np.sqrt(np.mean(np.sum(values[:, k : k + 3] ** 2, axis=1)))) for k in (0, 3)
-    )
+    means = _halves(np.array([rows.mean(axis=0) for rows in groups]))
+    total = float(np.sum(np.concatenate(groups)[:, :3] ** 2))
+    share = float(sizes @ means[:, 0]) / max(total, 1e-18) - sizes.size / int(sizes.sum())
+    place, turn = np.sqrt(means.mean(axis=0)).tolist()
     return share, place, turn
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from anser_ros.apps.poses.effect import PoseEffect
-from anser_ros.apps.poses.effects.episodes import in_episode
+from anser_ros.apps.poses.effects.episodes import in_episode, is_passed
 from anser_ros.apps.poses.problem import PoseResiduals, Sensing, jitter, stamp_step
 from anser_ros.apps.poses.sequence import REFERENCE, PoseSequence, PoseSession, jumping_poses
 from anser_ros.arrays import Array, Booleans
@@ -125,37 +125,26 @@ class PoseOutliers(PoseEffect):
         """Return one record of the outlying poses of all sensors."""
         found = _leaping(residuals.session)
         # Those of an episode are off together, and errors of places come gradually.
-        outs = [sudden_poses(s) & ~in_episode(s, residuals) for s in residuals.sensors]
+        outs = [sudden_poses(s) & ~is_passed(s, residuals) for s in residuals.sensors]
         out = np.concatenate(outs)
         used = np.concatenate([s.used for s in residuals.sensors])
         count = int(np.count_nonzero(out))
         share = count / max(count + int(np.count_nonzero(used)), 1)
         if found or share < FEWEST_OUTLIERS or count < FEWEST_OUTLYING_POSES:
             return found
-        residual = np.concatenate([s.residual for s in residuals.sensors])[out]
-        place, turn = (np.linalg.norm(residual[:, k : k + 3], axis=1) for k in (0, 3))
-        noise = np.repeat(
-            [[s.noise.position_m, s.noise.orientation_rad] for s in residuals.sensors],
-            [np.count_nonzero(mask) for mask in outs],
-            axis=0,
-        )
-        far, turned = place / noise[:, 0], turn / noise[:, 1]
-        if float(np.median(np.maximum(far, turned))) < FAR:
+        every = list(zip(residuals.sensors, outs, strict=True))
+        halves = np.concatenate([s.residual[m] for s, m in every]).reshape(-1, 2, 3)
+        away = np.linalg.norm(halves, axis=2)
+        noise = [[s.noise.position_m, s.noise.orientation_rad] for s in residuals.sensors]
+        spreads = away / np.repeat(noise, [np.count_nonzero(m) for m in outs], axis=0)
+        if float(np.median(spreads.max(axis=1))) < FAR:
             return []  # the tail of a distribution, and no poses of their own
         values = {
             'fraction': share,
-            'position_m': float(np.median(place)),
-            'orientation_rad': float(np.median(turn)),
-            'by_sensor': {
-                s.view.sensor: int(m.sum()) for s, m in zip(residuals.sensors, outs, strict=True)
-            },
-            **_when(
-                residuals.session,
-                {
-                    s.view.sensor: s.view.time[m]
-                    for s, m in zip(residuals.sensors, outs, strict=True)
-                },
-            ),
+            'position_m': float(np.median(away[:, 0])),
+            'orientation_rad': float(np.median(away[:, 1])),
+            'by_sensor': {s.view.sensor: int(m.sum()) for s, m in every},
+            **_when(residuals.session, {s.view.sensor: s.view.time[m] for s, m in every}),
         }
         return [EffectRecord(self.name, values, {'fraction': float(np.sqrt(share / out.size))})]
 
