@@ -166,11 +166,11 @@ def pose_verdict(document: dict[str, Any]) -> str:
     if document['left_out']:
         names = ', '.join(document['left_out'])
         text += f' Left out, with too few poses at times with a reference: {names}.'
-    if rest['fraction'] > 0:
+    if round(rest['fraction'], 2) > 0:
         on = ', '.join(rest['depends_on']) or 'none of the variables examined'
         share = f'{rest["fraction"]:.0%} of the squared error above the jitter stays unexplained'
-        text += f' {share if found else "More than the jitter has no name here"}; it depends on '
-        text += f'{on}.'
+        words = share if before != after else 'More than the jitter has no name here'
+        text += f' {words}; it depends on {on}.'
         if 'distance' in rest['depends_on']:
             text += (
                 ' It is larger far from the field generator, as at the edge of its volume or '
