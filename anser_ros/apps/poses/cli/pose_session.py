@@ -169,7 +169,7 @@ def pose_verdict(document: dict[str, Any]) -> str:
     if round(rest['fraction'], 2) > 0:
         on = ', '.join(rest['depends_on']) or 'none of the variables examined'
         share = f'{rest["fraction"]:.0%} of the squared error above the jitter stays unexplained'
-        words = share if before != after else 'More than the jitter has no name here'
+        words = share if before != after else 'The error above the jitter is not corrected'
         text += f' {words}; it depends on {on}.'
         if 'distance' in rest['depends_on']:
             text += (
