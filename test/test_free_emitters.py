@@ -177,10 +177,7 @@ def test_sessions_that_turn_about_one_axis_each_determine_a_lever_arm_together()
     np.testing.assert_allclose(np.abs(open_ways(about[:1])), [X], atol=1e-9)
     assert not len(open_ways(about))
     one, both = (SensorParameters(part, KINDS) for part in (about[:1], about))
-    held, free = (p.rule()[np.ix_(*[p.rows('lever_arm')] * 2)] for p in (one, both))
-    assert held.shape == free.shape == (3, 3) and not free.any() and 'axes' in one.kinds
-    # An arm along the axis of all turns is held, and none across it.
-    assert held[0, 0] > 1e17 and not held[1:, 1:].round().any()
+    assert 'lever_arm' not in one.kinds and 'lever_arm' in both.kinds and 'axes' in one.kinds
     assert 'lever_arm' not in SensorParameters([rests], KINDS).kinds
     kinds = [SensorParameters([m], KINDS).kinds for m in (rests, rests.sensors_only([0]))]
     assert ['axes' in own for own in kinds] == [True, False]

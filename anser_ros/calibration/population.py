@@ -206,7 +206,7 @@ class Population:
         parameters, sigmas = self.parameters, self._data_sigmas(likelihood)
         if SHARED_SHIFT not in parameters.asked:
             return 0.0
-        if not parameters.is_open and sigmas.get(SHARED_SHIFT, np.inf) <= USEFUL[SHARED_SHIFT]:
+        if sigmas.get(SHARED_SHIFT, np.inf) <= USEFUL[SHARED_SHIFT]:
             variance = np.diag(found.covariance)[parameters.rows(SHARED_SHIFT)].reshape(-1, 3)
             return float(np.sqrt(variance.mean(axis=1).min()))
         if 'places' not in sigmas or all(len(table) < 2 for table in parameters.tables):

@@ -371,8 +371,6 @@ class SensorFitter:
         """Kinds that the scan does not determine, those among them that were not even tried."""
         asked, tried = self.parameters.asked, self.parameters.kinds
         wide = {kind: PRIOR[kind] for kind in asked if kind not in tried}
-        if SHARED_SHIFT in asked and self.parameters.is_open:
-            wide[SHARED_SHIFT] = PRIOR[SHARED_SHIFT]  # along the axis of all turns
         return {**self.population.undetermined(self.likelihood), **wide}
 
     def _report(self, done: int) -> None:

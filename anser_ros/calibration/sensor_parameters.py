@@ -155,14 +155,12 @@ class SensorParameters:
             set(kinds) if all(m.is_followed for m in measurements) else {*kinds} - {*CLOCKS}
         )
         bodies = list(dict.fromkeys(m.body for m in measurements))
-        self.open_ways: dict[str, Array] = {}
         for body in bodies:
             own = [m for m in measurements if m.body == body]
-            ways = self.open_ways[body] = open_ways(own)
-            estimated -= {SHARED_SHIFT} if len(ways) == 3 else set()
+            ways = open_ways(own)
+            estimated -= {SHARED_SHIFT} if len(ways) else set()
             if is_free and len(own[0].sensors) == 1 and len(ways) == 3:
                 estimated -= {'axes'}  # a tilt that all poses share is the field's too
-        self.is_open = any(len(ways) for ways in self.open_ways.values())
         if not self.omega.any():
             estimated -= {'delays'}
         # Of all bodies, and of each.
@@ -253,9 +251,6 @@ class SensorParameters:
                 groups += list(np.arange(own.start, own.stop).reshape(-1, EACH[kind]).T)
         for rows in groups:
             out[np.ix_(rows, rows)] += 1.0 / (rows.size * BY_RULE**2)
-        for body, ways in self.open_ways.items():  # no arm along an axis of all turns
-            if (arm := self.slices.get((SHARED_SHIFT, body))) is not None:
-                out[arm, arm] += ways.T @ ways / BY_RULE**2
         return out
 
     def by_rule(self, values: Array) -> tuple[Array, float]:

@@ -404,15 +404,16 @@ class FieldModel:
         coils, share.
 
         An open lever arm's error has shifted the field as the scan had the body, and a turn of all
-        its coils has turned it, both along what the scan did not turn. A pose is off by what these
-        are now beside that: by nothing where the body is turned as it was.
+        its coils has turned it, about what the scan did not turn. A pose is off by what these are
+        now beside that: by nothing where the body is turned as it was.
         """
         known, arm = np.diag([self.shift_sigma_m**2] * 3 + [0.0] * 3), self.open_arms.get(body)
         if arm is None or rotation is None:
             return known
-        away = (arm.turn - rotation) @ unturned(arm.turn).T
+        away = arm.turn - rotation
         known[:3, :3] += arm.sigma_m**2 * (away @ away.T - np.eye(3))
-        known[3:, 3:] = arm.axes_rad**2 * away @ away.T
+        turned = away @ unturned(arm.turn).T
+        known[3:, 3:] = arm.axes_rad**2 * turned @ turned.T
         return known
 
     def with_dipoles(
