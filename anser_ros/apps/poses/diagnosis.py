@@ -22,7 +22,6 @@ from anser_ros.apps.poses.fit import (
     knows_levers,
     most_poses,
     noise_of,
-    unexplained_poses,
     with_time_constants,
 )
 from anser_ros.apps.poses.hand_eye import records_of
@@ -39,6 +38,7 @@ from anser_ros.apps.poses.search import (
     PoseSearch,
     frame_terms,
     search_effects,
+    weights_of,
     with_noise,
 )
 from anser_ros.apps.poses.sequence import REFERENCE, PoseSession
@@ -63,8 +63,7 @@ def judged(problem: PoseProblem, fit: PoseFit) -> PoseProblem:
     """Return a problem with the noise of a fit, and without the poses that stand out from it."""
     every = tuple(np.ones(s.size) for s in problem.sensors)
     noisy = replace(problem, weight=every, noise=fit.state.problem.noise)
-    out = unexplained_poses(noisy.state(fit.terms))
-    return replace(noisy, weight=tuple(np.where(mask, 0.0, 1.0) for mask in out))
+    return replace(noisy, weight=weights_of(noisy.state(fit.terms)))
 
 
 def errors_of(state: PoseState) -> HeldOutErrors:
@@ -288,13 +287,14 @@ def diagnose_poses(
     state = search.fit.state
     # A clock may stand for what else there is besides jitter.
     if is_searched and not search.knows_levers and state.rms()[0] > ABOVE_FLOOR * floor_of(state):
-        alone_fit = fit_poses(state.problem, frame_terms(search.fit.terms))
-        search = replace(search, fit=alone_fit, evidence=(None,) * len(alone_fit.terms))
+        search = _alone(search, 'leaves more than jitter, and no lever arm is known')
     search = _confirmed(search, problem, test)
-    found = search.fit
-    whole = _on_all(session, problem, found, is_searched and search.knows_levers)
     own = problem.rows([poses.time >= begin for poses in problem.sensors])
-    before, after, registered = held_out(own, found, test)
+    before, after, registered = held_out(own, search.fit, test)
+    if after.rms()[0] > before.rms()[0] and any(search.evidence):
+        search = _alone(search, 'held-out poses are worse with all that is found')
+        before, after, registered = held_out(own, search.fit, test)
+    whole = _on_all(session, problem, search.fit, is_searched and search.knows_levers)
     residuals = _residuals(session, problem, whole)
     records = records_of(whole, search.evidence, session)
     most = most_poses(session)
@@ -393,19 +393,28 @@ def _outside_episodes(
     return again if again.knows_levers else search
 
 
+def _alone(search: PoseSearch, why: str) -> PoseSearch:
+    """The search with the frames alone."""
+    problem, terms = search.fit.state.problem, frame_terms(search.fit.terms)
+    return _less(search, with_noise(fit_poses(problem, terms), False), why)
+
+
+def _less(search: PoseSearch, fit: PoseFit, why: str) -> PoseSearch:
+    """The search with a fit that lacks some of its effects, and why."""
+    terms, left = search.fit.terms, {term.label for term in fit.terms}
+    refused = [(term.label, why) for term in terms if term.label not in left]
+    evidence = [e for e, t in zip(search.evidence, terms, strict=True) if t.label in left]
+    return replace(search, fit=fit, evidence=tuple(evidence), refused=(*search.refused, *refused))
+
+
 def _confirmed(search: PoseSearch, problem: PoseProblem, test: Integers) -> PoseSearch:
     """The search without effects that positions do not confirm."""
     fit = search.fit
-    for index, term in enumerate(fit.terms):
-        if term.role.is_frame:
-            continue
+    for term in (t for t in fit.terms if not t.role.is_frame):
         rest = fit_poses(fit.state.problem, [t for t in fit.terms if t is not term])
         why = unconfirmed(rest, fit, term, judged(problem.in_blocks(test), fit))
         if why:
-            evidence = tuple(e for k, e in enumerate(search.evidence) if k != index)
-            refused = (*search.refused, (term.label, why))
-            left = replace(search, fit=rest, evidence=evidence, refused=refused)
-            return _confirmed(left, problem, test)
+            return _confirmed(_less(search, rest, why), problem, test)
     return search
 
 
@@ -413,27 +422,17 @@ def unconfirmed(rest: PoseFit, fit: PoseFit, term: PoseTerm, unseen: PoseProblem
     """Return why an effect is not believed beside the rest; empty where it is.
 
     ``rest`` is the fit without it, and ``unseen`` the held-out poses.
-
     Poses near each other err alike, and a few places may ask for what no others confirm. Where
     stamps jitter, an error of places weighs little beside one across the velocity or of turns; a
     map that moves poses but takes nothing off their errors makes up for frames that it has moved.
     On a path that comes again, a tracker's own errors look like a small offset, lag or scale.
     """
-    taken = _square(rest.state, term) - _square(fit.state, term)
+    taken = rest.state.rms(term.sensor)[0] ** 2 - fit.state.rms(term.sensor)[0] ** 2
     least = LEAST_MAP_M if term.role is Role.MAP else LEAST_REPORTED_M
     if taken < least**2:
         return f'takes less than {1e3 * least:g} mm off the errors of positions'
-    before, after = (_square(unseen.state(one.terms), term) for one in (rest, fit))
-    if term.effect.blocks_in_space and before < after:
-        return 'held-out poses are worse with it'
-    return ''
-
-
-def _square(state: PoseState, term: PoseTerm) -> float:
-    """Mean squared error of the positions, m^2, of the sensors that a term is about."""
-    parts = [p for p in state.parts if term.acts_on(p.view.sensor)]
-    total = sum(float(np.sum(p.residual[p.used, :3] ** 2)) for p in parts)
-    return total / max(sum(np.count_nonzero(p.used) for p in parts), 1)
+    before, after = (unseen.state(one.terms).rms(term.sensor)[0] for one in (rest, fit))
+    return 'held-out poses are worse with it' if before < after else ''
 
 
 def _residuals(session: PoseSession, problem: PoseProblem, whole: PoseFit) -> PoseResiduals:

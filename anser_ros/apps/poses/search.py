@@ -242,17 +242,17 @@ def with_noise(fit: PoseFit, with_stamps: bool = True) -> PoseFit:
     """
     problem, state = fit.state.problem, fit.state
     for _ in range(NOISE_ROUNDS):
-        cut = replace(problem, weight=_weights(state))
+        cut = replace(problem, weight=weights_of(state))
         parts = cut.state(fit.terms).parts
         noise = tuple(likely_noise(p) if with_stamps else noise_of(p, False)[0] for p in parts)
         every = tuple(np.ones(weight.size) for weight in cut.weight)
         problem = replace(problem, weight=every, noise=noise)
         state = problem.state(fit.terms)
-    return fit_poses(replace(problem, weight=_weights(state)), fit.terms)
+    return fit_poses(replace(problem, weight=weights_of(state)), fit.terms)
 
 
-def _weights(state: PoseState) -> tuple[Array, ...]:
-    """Weights of the poses of a state, none of those that stand out."""
+def weights_of(state: PoseState) -> tuple[Array, ...]:
+    """Return weights of the poses of a state, zero of those that stand out."""
     return tuple(np.where(mask, 0.0, 1.0) for mask in unexplained_poses(state))
 
 

@@ -188,15 +188,14 @@ def _recordings(
 
 
 def _time_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[Integers, ...]:
-    """Equal stretches of time, or the recordings where there are several."""
+    """Equal stretches of time without pauses, or the recordings where there are several."""
     if starts.size + 1 >= FEWEST_PARTS:
         return tuple(np.searchsorted(starts, p.time, side='right') for p in sensors)
-    first = min(float(poses.time[0]) for poses in sensors)
-    length = max(max(float(poses.time[-1]) for poses in sensors) - first, 1e-9)
-    return tuple(
-        np.minimum((BLOCKS * (p.time - first) / length).astype(np.int64), BLOCKS - 1)
-        for p in sensors
-    )
+    every = np.unique(np.concatenate([poses.time for poses in sensors]))
+    steps = np.diff(every, prepend=every[0])
+    run = np.cumsum(np.where(steps > PAUSE_S, 0.0, steps))
+    share = [np.interp(p.time, every, run) / max(float(run[-1]), 1e-9) for p in sensors]
+    return tuple(np.minimum((BLOCKS * s).astype(np.int64), BLOCKS - 1) for s in share)
 
 
 def _space_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[Integers, ...]:

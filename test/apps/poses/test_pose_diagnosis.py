@@ -9,6 +9,7 @@ from clean_poses import MOTIONS, STREAMS, clean_world
 from pose_world import FRAME, SHIFT, World
 from scipy.spatial.transform import Rotation
 
+from anser_ros.apps.poses import diagnosis
 from anser_ros.apps.poses.cli.pose_session import pose_verdict
 from anser_ros.apps.poses.corrector import to_document
 from anser_ros.apps.poses.diagnosis import diagnose_poses, unconfirmed
@@ -260,6 +261,46 @@ def test_stamps_of_a_poll_are_told_from_those_that_jitter():
     found = named(diagnose_poses(world.session()))
     assert set(found) == {'quantised_stamps'}
     assert found['quantised_stamps'].parameters['step_s'] == pytest.approx(0.0312, rel=0.01)
+    # No rounding to the steps of a device's counter makes errors of more than half a step.
+    world = World(12, duration=25.0, sensors=1)
+    world.jitter, world.after = 0.005, polled(0.008, np.round)
+    assert set(named(diagnose_poses(world.session()))) == {'stamp_jitter'}
+
+
+@pytest.mark.parametrize('is_judged_alone', [True, False])
+def test_what_makes_held_out_poses_worse_is_not_applied(is_judged_alone, monkeypatch):
+    if not is_judged_alone:
+        monkeypatch.setattr(diagnosis, 'unconfirmed', lambda *given: '')
+    world = World(31, duration=25.0, sensors=2)
+
+    def other_in_every_fifth_block(streams):
+        for name in ('sensor_0', 'sensor_1'):
+            time = streams[name][0]
+            time += np.where((25 * time / 25.0).astype(int) % 5 == 3, -0.04, 0.02)
+        return streams
+
+    world.after = other_in_every_fifth_block
+    found = diagnose_poses(world.session())
+    assert 'time_offset' not in named(found)
+    assert found.after.position_m <= 1.001 * found.before.position_m
+    assert any('held-out poses are worse' in why for _, why in found.refused)
+
+
+def test_a_long_pause_between_two_recordings_takes_no_part_in_the_blocks_of_time():
+    world = World(17, duration=300.0, sensors=2)
+    world.offset = 0.04
+
+    def two_recordings(streams):
+        return {
+            name: [one[np.abs(rows[0] - 150) > 138] for one in rows]
+            for name, rows in streams.items()
+        }
+
+    world.after = two_recordings
+    found = diagnose_poses(world.session())
+    assert set(named(found)) == {'time_offset'}
+    assert np.unique(found.fit.state.parts[0].blocks).size == 25
+    assert found.after.position_m < 1e-3
 
 
 def test_a_body_at_rest_tells_no_lever_arm_and_breaks_nothing():

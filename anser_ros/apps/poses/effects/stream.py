@@ -226,8 +226,8 @@ LEAST_S = 2e-3
 """Error of the stamps, s, from which it is named: less moves a hand by a tenth of a millimetre."""
 LEAST_LIKELIHOOD_GAIN = 25.0
 """Minus twice the log likelihood that it must take off in the median sensor; chance takes one."""
-STEP_SHARE = (0.15, 0.7)
-"""Error over the step that rounding to a step makes: 0.29 if even, more if a poll is late."""
+STEP_SHARE = (0.15, 0.45)
+"""Error over the step that rounding to a step makes: 0.29 if even, 0.41 if late by as much."""
 
 
 def _stamp_error(residuals: PoseResiduals) -> tuple[float, float, float]:
