@@ -44,6 +44,8 @@ CHANCE = 0.01
 FILTER_STEPS = 3  # Newton's, to a time constant that is known to some percent
 NEAR_TAU = 1.25
 """Factor by which positions alone may move a time constant; without a filter it leads anywhere."""
+STRAINED = 1.85
+"""Squares of five strains over those of their noise from which they are seen: chance, 1 in 10."""
 FARTHEST_LOG = 100.0
 """Logarithm of a spread, either way, at which a search for the likeliest one stops: no number of
 this size has an overflow."""
@@ -163,14 +165,14 @@ def strain_variance(fit: PoseFit) -> float:
     """
     setting = fit.state.problem.setting
     linear = next(t for t in effect_with(Role.MAP).sites(setting) if t.theta.size == 9)
-    shared = (Role.SCALE, Role.MAP)
-    terms = [linear, *(t for t in fit.terms if t.sensor or t.role not in shared)]
+    terms = [linear, *(t for t in fit.terms if t.sensor or t.role not in (Role.SCALE, Role.MAP))]
     trial = fit_poses(fit.state.problem, terms, 3)
     other = np.eye(9) + np.eye(9).reshape(3, 3, 9).swapaxes(0, 1).reshape(9, 9)
     unequal = other / 2 - np.outer(np.eye(3), np.eye(3)).reshape(9, 9) / 3
     strains = unequal @ trial.terms[0].theta / setting.size
     noise = np.trace(unequal @ trial.covariance_of(0) @ unequal) / setting.size**2
-    return max(float(strains @ strains) - float(noise), 0.0) / 9
+    seen = float(strains @ strains)
+    return (seen - float(noise)) / 9 if seen > STRAINED * noise else 0.0
 
 
 def with_time_constants(fit: PoseFit) -> PoseFit:
