@@ -188,12 +188,12 @@ def _recordings(
 
 
 def _time_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[Integers, ...]:
-    """Equal stretches of time without pauses, or the recordings where there are several."""
+    """Equal stretches of time, of a long pause 10 s, or the recordings if there are several."""
     if starts.size + 1 >= FEWEST_PARTS:
         return tuple(np.searchsorted(starts, p.time, side='right') for p in sensors)
     every = np.unique(np.concatenate([poses.time for poses in sensors]))
     steps = np.diff(every, prepend=every[0])
-    run = np.cumsum(np.where(steps > PAUSE_S, 0.0, steps))
+    run = np.cumsum(np.minimum(steps, 5 * PAUSE_S))
     share = [np.interp(p.time, every, run) / max(float(run[-1]), 1e-9) for p in sensors]
     return tuple(np.minimum((BLOCKS * s).astype(np.int64), BLOCKS - 1) for s in share)
 
