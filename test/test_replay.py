@@ -111,6 +111,16 @@ def play(ros, monkeypatch):
         node.destroy_node()
 
 
+@pytest.mark.parametrize('awaits', [True, False])
+def test_a_server_whose_first_refit_is_being_made_is_not_ready(awaits):
+    """Frames that came now would have no poses, but `evaluate --refit` has them."""
+    look = object.__new__(readiness.Readiness)
+    look._since_s, values = 0.0, {'stamp_ns': '1', 'awaits_refit': str(awaits)}
+    look._reports = {'anser/field_model': (1.0, values)}
+    fluxes = {'/anser/reference/flux': ['/anser/field_model']}
+    assert look._is_ready('/anser/field_model', fluxes) is not awaits
+
+
 @pytest.mark.parametrize('listener', [100], indirect=True)
 def test_everything_arrives_with_its_stamps(start, listener, tmp_path):
     bag = make_session(tmp_path / 'a.mcap', 100)

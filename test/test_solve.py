@@ -343,3 +343,7 @@ def test_grids_and_starts_that_are_none_are_refused():
         grid_points(VOLUME, 0.0)
     with pytest.raises(TrackingError, match='too fine'):
         grid_points(VOLUME, 1e-3)
+
+
+def test_of_an_information_that_is_not_finite_nothing_is_known():
+    np.testing.assert_array_equal(bounded_inverse(np.full((6, 6), np.nan)), np.eye(6))

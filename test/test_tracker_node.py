@@ -138,6 +138,28 @@ def test_another_model_while_it_runs(tracker, tmp_path):
     assert tracker.node.counters['callback_faults'] == 0
 
 
+@pytest.mark.parametrize('none', ['', 'nominal'])
+def test_without_its_model_file_no_pose_is_given_by_the_old_field(tracker, tmp_path, none):
+    """No server has published a model, so that the file's field was what frames were solved by."""
+    save_model(tmp_path / 'own.yaml', certain_model())
+    give = (
+        [Parameter('model_file', value=str(tmp_path / 'own.yaml'))],
+        [Parameter('model_file', value=none)],
+    )
+    rng = np.random.default_rng(5)
+    tracker.say_setup()
+    tracker.spin_until(lambda: tracker.node._half is not None)
+    for parameters, state in zip(give, ('ok', 'no_model'), strict=True):
+        assert tracker.node.set_parameters(parameters)[0].successful
+        tracker.say_flux(fluxes(certain_model(), SENSORS, *random_pose(rng), rng))
+
+        def is_so(state=state):
+            tracker.node.publish_diagnostics()
+            return tracker.state(f'anser/tracker: {BODY}') == state
+
+        tracker.spin_until(is_so)
+
+
 def test_the_gate_may_change_while_it_runs(tracker):
     ready(tracker)
     results = tracker.node.set_parameters([Parameter('gate', value=7.5)])

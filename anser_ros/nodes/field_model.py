@@ -432,7 +432,7 @@ class FieldModelNode(AnserNode):
         values['fingerprint'] = '' if self._base is None else self._base.fingerprint
         values |= field_model_refit.model_values(model, self.parameters.model_file)
         values |= {'stamp_ns': self._stamp_ns, 'freeze': self._frozen}
-        values['refit_time_s'] = self._refit.update_s
+        values |= {'refit_time_s': self._refit.update_s, 'awaits_refit': self._refit.is_awaited}
         is_wanted, refused = self.parameters.refit, self._no_baseline
         words = field_model_refit.activity(self._refit, self._frozen, is_wanted, refused, values)
         if self._is_uncalibrated:

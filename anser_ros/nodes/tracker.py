@@ -382,7 +382,10 @@ class TrackerNode(AnserNode):
             check_emitters(setup, file_model)
         self._file_model = file_model
         if setup is not None and self._half is not None:
-            self._begin(setup, self._half.tracker)
+            tracker = self._half.tracker
+            if file_model is None and self._given is None:  # there is none any more
+                tracker = Tracker(None, tracker.sensors, tracker.settings)
+            self._begin(setup, tracker)
             self._use_model()
 
     def status(self) -> Status:

@@ -159,6 +159,8 @@ def bounded_inverse(information):  # type: ignore[no-untyped-def]
         unit[j] = 0.0
         for i in range(j, n):
             covariance[i, j] = covariance[j, i] = column[i]
+    if not is_sure and not np.isfinite(scaled).all():  # at a dipole itself: nothing is known
+        return UNKNOWN_VARIANCE * np.eye(n)
     if not is_sure:
         values, vectors = np.linalg.eigh(scaled)
         for i in range(n):

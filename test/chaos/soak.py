@@ -24,6 +24,9 @@ UNPLUG_EVERY_S, UNPLUGGED_S = 60.0, 2.0
 """Time from one unplugging to the next, and how long the cable is out, s."""
 HOUR_S = 3600.0
 """Seconds in an hour."""
+OWN = 'RssAnon', 'RssShmem', 'VmSwap'
+"""What counts as a node's own memory, by its names in /proc: its blocks, what it shares with other
+processes through the middleware, and what of them is on disk."""
 
 
 @dataclass
@@ -40,7 +43,7 @@ class Series:
         """Look at the process."""
         process = Path(f'/proc/{pid}')
         status = dict(line.split(':', 1) for line in (process / 'status').read_text().splitlines())
-        memory = sum(1.024e-3 * int(status[key].split()[0]) for key in ('RssAnon', 'VmSwap'))
+        memory = sum(1.024e-3 * int(status[key].split()[0]) for key in OWN)
         files = len(list((process / 'fd').iterdir()))
         threads = len(list((process / 'task').iterdir()))
         self.rows.append((time_s, memory, files, threads))

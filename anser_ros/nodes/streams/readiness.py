@@ -122,7 +122,7 @@ class Readiness:
         if reported_s < self._since_s or not is_listening:
             return False
         if name.endswith(FIELD_MODEL):
-            return bool(values.get('stamp_ns'))
+            return bool(values.get('stamp_ns')) and values.get('awaits_refit') != str(True)
         served = self._report(f'{self._home}/{FIELD_MODEL}')[1].get('stamp_ns', '')
         has_model = not served or values.get('model_stamp_ns') == served
         return values.get('ready_for') == self._digest and has_model
