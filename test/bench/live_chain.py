@@ -96,7 +96,7 @@ from anser_ros.wire.frames import encode
 from anser_ros.wire.frames import SampleBlock, Start
 
 def main():
-    link, blocks, topics = sys.argv[1], int(sys.argv[2]), sys.argv[3:]
+    link, blocks, topics = sys.argv[1], float(sys.argv[2]), sys.argv[3:]
     rclpy.init()
     node = rclpy.create_node('floor')
     publishers = [node.create_publisher(PoseStamped, topic, qos.STREAM) for topic in topics]
@@ -109,8 +109,8 @@ def main():
     while True:
         for record in reader.feed(os.read(line, 65536)):
             payload = record.payload
-            if isinstance(payload, SampleBlock) and (payload.sequence + 1) % blocks == 0:
-                message.header.stamp.sec = (payload.sequence + 1) // blocks
+            if isinstance(payload, SampleBlock) and (payload.sequence + 1) % blocks < 1.0:
+                message.header.stamp.sec = int((payload.sequence + 1) // blocks)
                 for publisher in publishers:
                     publisher.publish(message)
 
@@ -218,7 +218,7 @@ class Run:
 def _chain(layout: Layout, link: Path, folder: str, topics: list[str]) -> dict[str, list[str]]:
     """Return the commands of the processes by name."""
     if layout.is_floor:
-        blocks = str(round(1 / layout.rate_hz / BLOCK_S))
+        blocks = str(1 / layout.rate_hz / BLOCK_S)
         return {'floor': [sys.executable, '-c', FLOOR, str(link), blocks, *topics]}
     model = config_path('demo_model.yaml')
     refit = {'refit': layout.follows, 'baseline_at_start': layout.follows}
@@ -299,18 +299,20 @@ def _latencies(
     The stamp is the middle of a window, late by the line's shortest delay, which is far below the
     spacing of windows; so the nearest window is the right one. The floor stamps with its number.
     """
-    hop_ms, window_ms = round(1 / layout.rate_hz / BLOCK_S), round(WINDOW_S / BLOCK_S)
+    hop, window = 1 / layout.rate_hz / BLOCK_S, WINDOW_S / BLOCK_S  # in blocks
     taken = np.array(feeder.taken_ns)
     if layout.is_floor:
-        window_ms = hop_ms
-    ends = np.arange(window_ms, len(taken) + 1, hop_ms)
-    taken = taken[ends - 1]
+        window = hop
+    ends = np.arange(window, len(taken), hop)
+    taken = taken[
+        np.ceil(ends - 1e-6).astype(int) - 1
+    ]  # the block that has a window's last sample
     if layout.is_floor:
         window = poses[:, 1] // 10**9 - 1
     else:
         middles = feeder.begin_ns + ends * BLOCK_S * 1e9 - WINDOW_S * 0.5e9
         stamps = poses[:, 1] - (time.time_ns() - time.monotonic_ns())
-        window = np.searchsorted(middles, stamps - 0.5 * hop_ms * 1e6)
+        window = np.searchsorted(middles, stamps - 0.5 * hop * BLOCK_S * 1e9)
     known = (window >= 0) & (window < len(ends))
     latency_ms = np.full((len(ends), layout.poses), np.inf)
     rows = poses[known]
