@@ -11,6 +11,7 @@ from anser_ros.errors import ModelFileError
 from anser_ros.field.model import (
     EffectRecord,
     FieldModel,
+    OpenArm,
     ReferenceReadings,
     from_document,
     to_document,
@@ -250,3 +251,15 @@ def test_the_drawing_gives_poses_only_where_it_may(allowed, state):
     drawn = nominal_model(anser_board())
     assert is_nominal(drawn) and is_nominal(from_document(to_document(drawn)))
     assert not is_nominal(model)
+
+
+def test_a_model_keeps_its_name_from_before_axes_were_open():
+    """A file of then states this fingerprint, and would be refused with another."""
+    arm = OpenArm(0.004, np.eye(3))
+    model = FieldModel(
+        np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.ones((1, 1), complex), ('a',),
+        (1000.0,), open_arms={'tool': arm},
+    )  # fmt: skip
+    assert model.fingerprint == 'dc628230'
+    turned = replace(model, open_arms={'tool': replace(arm, axes_rad=0.01)})
+    assert turned.fingerprint != 'dc628230'

@@ -359,7 +359,8 @@ class FieldModel:
                 self.flux_error_t, self.modes,
                 [[effect.name, plain(dict(effect.parameters))] for effect in self.effects],
                 *(value for value in (self.shift_sigma_m, self.noise_t) if value),
-                *(part for arm in self.open_arms.values() for part in asdict(arm).values()),
+                *(v for a in self.open_arms.values() for v in (a.sigma_m, a.turn)),
+                *(a.axes_rad for a in self.open_arms.values() if a.axes_rad),
             ]
         )  # fmt: skip
 

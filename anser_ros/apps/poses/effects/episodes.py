@@ -205,10 +205,12 @@ def is_passed(sensing: Sensing, residuals: PoseResiduals) -> Booleans:
 
 def _nearest_later(place: Array, window: Integers) -> Array:
     """Distance (n,), m, of places (n, 3) from the nearest at another time; `NEAR_M` at least."""
-    away = np.linalg.norm(place[:, None] - place, axis=2)
-    away[np.abs(window[:, None] - window) <= NEIGHBOURS] = np.inf
-    least = away.min(axis=1)
-    return np.where(np.isfinite(least), np.maximum(least, NEAR_M), NEAR_M)
+    out = np.full(len(place), NEAR_M)
+    for number in np.unique(window):
+        here, later = window == number, place[np.abs(window - number) > NEIGHBOURS]
+        if len(later):
+            out[here] = np.maximum(cKDTree(later).query(place[here])[0], NEAR_M)
+    return out
 
 
 def _is_revisited(inside: Array, outside: Array, near: Array | float) -> bool:
