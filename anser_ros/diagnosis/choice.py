@@ -194,7 +194,8 @@ def taken_from_others(fit: Fit) -> float:
 def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
     """Return the best fit, or a simpler one that is as good within what its parameters could gain.
 
-    If several leave nothing but noise, the simplest is chosen.
+    If several leave nothing but noise, the simplest is chosen. Metal, whose shape is free, is not
+    taken where something simpler explains nearly as much.
     """
     gain, best = max(fitted, key=lambda pair: pair[0])
     newest = best.newest
@@ -205,12 +206,19 @@ def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
     ]
     if steady:
         gain, best = max(steady, key=lambda pair: pair[0])
-    most = best.newest.complexity
+    most, is_metal = best.newest.complexity, best.newest.effect.family.is_metal
     simpler = [
         (g, f)
         for g, f in fitted
         if f.newest.complexity < most
-        and gain - g < decisions.as_good(most - f.newest.complexity) * max(best.misfit, 1.0)
+        and (
+            gain - g < decisions.as_good(most - f.newest.complexity) * max(best.misfit, 1.0)
+            or (
+                is_metal
+                and not f.newest.effect.family.is_metal
+                and g > (1.0 - decisions.ALIKE) * gain
+            )
+        )
     ]
     simpler += [
         (g, f)
