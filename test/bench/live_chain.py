@@ -304,9 +304,8 @@ def _latencies(
     if layout.is_floor:
         window = hop
     ends = np.arange(window, len(taken), hop)
-    taken = taken[
-        np.ceil(ends - 1e-6).astype(int) - 1
-    ]  # the block that has a window's last sample
+    # The block that has a window's last sample
+    taken = taken[np.ceil(ends - 1e-6).astype(int) - 1]
     if layout.is_floor:
         window = poses[:, 1] // 10**9 - 1
     else:

@@ -286,23 +286,6 @@ def test_what_makes_held_out_poses_worse_is_not_applied(is_judged_alone, monkeyp
     assert any('held-out poses are worse' in why for _, why in found.refused)
 
 
-def test_a_long_pause_between_two_recordings_leaves_most_blocks_of_time_with_poses():
-    world = World(17, duration=300.0, sensors=2)
-    world.offset = 0.04
-
-    def two_recordings(streams):
-        return {
-            name: [one[np.abs(rows[0] - 150) > 138] for one in rows]
-            for name, rows in streams.items()
-        }
-
-    world.after = two_recordings
-    found = diagnose_poses(world.session())
-    assert set(named(found)) == {'time_offset'}
-    assert np.unique(found.fit.state.parts[0].blocks).size > 12
-    assert found.after.position_m < 1e-3
-
-
 def test_a_body_at_rest_tells_no_lever_arm_and_breaks_nothing():
     world = World(3, duration=10.0, sensors=1)
 

@@ -1,4 +1,4 @@
-"""Several sessions in one command: folders, the summary, and failures as rows."""
+"""Several sessions in one command or one file: folders, the summary, failures as rows, pauses."""
 
 import argparse
 import contextlib
@@ -6,9 +6,11 @@ import csv
 import io
 import math
 
+import numpy as np
 import pytest
 from pose_world import World
 
+from anser_ros.apps.poses.diagnosis import diagnose_poses
 from anser_ros.apps.poses.importing import write_pose_session
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, EXIT_OK, main
 from anser_ros.cli.sessions import Outcome, names_of, on_each, row_of, write_summary
@@ -108,3 +110,20 @@ def test_a_row_is_the_pooled_error_of_all_coils(tmp_path):
     assert '&lt;lost&gt;' in (tmp_path / 'summary.html').read_text()
     (cells,) = read(tmp_path / 'summary.csv')
     assert cells['body_position_rmse_m'] == '' and cells['message'] == '<lost> a frame'
+
+
+def test_a_long_pause_between_two_recordings_leaves_most_blocks_of_time_with_poses():
+    world = World(17, duration=300.0, sensors=2)
+    world.offset = 0.04
+
+    def two_recordings(streams):
+        return {
+            name: [one[np.abs(rows[0] - 150) > 138] for one in rows]
+            for name, rows in streams.items()
+        }
+
+    world.after = two_recordings
+    found = diagnose_poses(world.session())
+    assert {one.name for one in found.records} == {'time_offset', 'hand_eye'}
+    assert np.unique(found.fit.state.parts[0].blocks).size > 12
+    assert found.after.position_m < 1e-3
