@@ -337,7 +337,7 @@ def error_draws(
     drawn += bank.drift @ rng.standard_normal((bank.width, count))
     readings = np.sqrt(power) * prior.draw_readings[bank.rows] + noise * drawn
     gain = power / (power * posterior.values + noise**2)
-    weights = gain[:, None] * (posterior.basis.T @ readings)
+    weights = (gain[:, None] * (posterior.basis.T @ readings)).astype(np.float32)
     return np.asarray(np.sqrt(power) * prior.draw_moments - posterior.synthesis @ weights)
 
 

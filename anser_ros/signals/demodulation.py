@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +59,6 @@ class ToneFit:
     phasors: ComplexArray  # (C, K), peak amplitude and phase in the middle of the window
     sigma: Array  # (C, K), standard deviation of the real and of the imaginary part
     noise: Array  # (C,), root mean square of the residual of a sample
-    # (C, K), change of the phasors per second; zero where it is not fitted
-    rates: ComplexArray
     # (2K, 2K), bias of the phasors [Re, Im] by rates [Re, Im] that the fit leaves out, s; None
     # where the rates are fitted
     motion_bias: Array | None = None
@@ -107,7 +106,6 @@ class Demodulator:
         if not SHORTEST_WINDOW_S - half_sample <= length_s <= LONGEST_WINDOW_S + half_sample:
             raise ParameterError(f'a window of {1e3 * length_s:.3g} ms is not 5 to 50 ms long')
         self.frequencies_hz = tones
-        self.window_s = length_s
         from_middle = np.arange(window_samples) - (window_samples - 1) / 2
         self._times_s = np.asarray(from_middle / sample_rate_hz, float)
         harmonics = _kept_harmonics(mains_hz, tones, sample_rate_hz, length_s)
@@ -155,13 +153,8 @@ class Demodulator:
         noise = np.sqrt(np.maximum(energy, 0.0) / freedom)
         count = self.frequencies_hz.size
         phasors = (coefficients[:count] + 1j * coefficients[count : 2 * count]).T
-        if self.follows_motion:
-            change = coefficients[2 * count : 3 * count] + 1j * coefficients[3 * count : 4 * count]
-            rates = np.asarray(change.T / (self.window_s / 2), complex)
-        else:
-            rates = np.zeros_like(phasors)
         variance = (solution.variance[:count] + solution.variance[count : 2 * count]) / 2
-        return ToneFit(phasors, noise[:, None] * np.sqrt(variance), noise, rates, bias)
+        return ToneFit(phasors, noise[:, None] * np.sqrt(variance), noise, bias)
 
     def _motion_bias(self, solution: _Solution, design: Array, times_s: Array) -> Array | None:
         """Return the phasors that a fit without motion finds in tones times t, (2K, 2K), s."""
@@ -241,13 +234,21 @@ class FluxWindow:
 
     # (S, K), flux density at nominal current, T; NaN for an emitter without current
     flux: ComplexArray
-    # (S, K), standard deviation of each component from the residual noise, T
-    sigma: Array
     # (K,), measured currents, A, with their phase in the middle of the window
     current: ComplexArray
     # (K,), standard deviation of each component of the currents, A
     current_sigma: Array
     driven: Booleans  # (K,), whether the emitter carries current
+    own_sigma: tuple[Array, ComplexArray]  # (S, K) each: of the phasors, and what makes them T
+
+    @cached_property
+    def sigma(self) -> Array:
+        """Return the standard deviation of each component from the residual noise, (S, K), T."""
+        magnitude, (own, to_flux) = np.abs(self.current), self.own_sigma
+        relative = np.divide(
+            self.current_sigma, magnitude, where=self.driven, out=np.zeros_like(magnitude)
+        )
+        return np.asarray(np.hypot(own * np.abs(to_flux), np.abs(self.flux) * relative))
 
 
 class FluxConverter:
@@ -293,8 +294,7 @@ class FluxConverter:
         """
         current = fit.phasors[self._current_column] * self._amperes_per_code
         current_sigma = fit.sigma[self._current_column] * np.abs(self._amperes_per_code)
-        magnitude = np.abs(current)
-        driven = magnitude > LEAST_CURRENT * self._nominal_a
+        driven = np.abs(current) > LEAST_CURRENT * self._nominal_a
         reference = np.full(current.shape, complex(np.nan, np.nan))
         reference[driven] = self._nominal_a[driven] / current[driven]
         to_flux = self._tesla_per_code * reference
@@ -304,11 +304,8 @@ class FluxConverter:
             np.divide(flux_rates, to_flux, where=driven & np.isfinite(flux_rates), out=rates)
             added = np.hstack([rates.real, rates.imag]) @ fit.motion_bias.T
             phasors = phasors - added[:, : driven.size] - 1j * added[:, driven.size :]
-        flux = phasors * to_flux
-        sensor_sigma = fit.sigma[self._columns] * np.abs(to_flux)
-        relative = np.divide(current_sigma, magnitude, where=driven, out=np.zeros_like(magnitude))
-        sigma = np.hypot(sensor_sigma, np.abs(flux) * relative)
-        return FluxWindow(flux, sigma, current, current_sigma, driven)
+        own = fit.sigma[self._columns], to_flux
+        return FluxWindow(phasors * to_flux, current, current_sigma, driven, own)
 
 
 REACH_S = 0.03
