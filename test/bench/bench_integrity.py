@@ -53,7 +53,7 @@ class Clock:
 
 def rows() -> Iterator[harness.Row]:
     """Yield the rows of the benchmark table."""
-    model = harness.calibrated(load_session(harness.BAGS / 'factory.mcap'), estimate=())
+    model = harness.calibrated(load_session(harness.BAGS / 'factory.mcap'))
     tool = load_session(harness.BAGS / 'moving.mcap').tools[0]
     tracker = Tracker(model, tool.sensors)
     clocks = {name: Clock() for name in (WHOLE, *CHECKS)}

@@ -57,8 +57,8 @@ def online_recordings() -> tuple[Path, dict[str, Path]]:
     }  # fmt: skip
 
 
-def calibrated(scan: Session, **options: Any) -> FieldModel:
-    """Return the model of a scan; without options, with a layout that takes no minutes to choose.
+def calibrated(scan: Session) -> FieldModel:
+    """Return the model of a scan with a layout that takes no minutes to choose.
 
     It is the one with which the choice by held-out error ends on the shared scan.
     """
@@ -67,9 +67,7 @@ def calibrated(scan: Session, **options: Any) -> FieldModel:
     from anser_ros.sessions.calibration import calibrate_sessions
 
     layout = Layout('drawing', 144, 1.0, 0.0, prior='nominal', moved=True)
-    return calibrate_sessions(
-        [scan], Options(**{'layout': layout, **(options or {'damping': 1e-6})})
-    ).model
+    return calibrate_sessions([scan], Options(layout=layout)).model
 
 
 class Done(NamedTuple):
