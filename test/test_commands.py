@@ -12,9 +12,9 @@ import sys
 from dataclasses import fields
 
 import pytest
-from chain import beginning
 from conftest import REPO
 from rclpy.utilities import remove_ros_args
+from shortened import beginning
 
 from anser_ros.cli import output
 from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE

@@ -4,7 +4,8 @@ import os
 from pathlib import Path
 
 import numpy as np
-from chain import beginning, replay_through_nodes
+from chain import replay_through_nodes
+from shortened import beginning
 
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chain import beginning, replay_through_nodes
+from chain import replay_through_nodes
 from conftest import made_once
+from shortened import beginning
 
 from anser_ros.pose_states import OK
 from anser_ros.sessions.session import load_session

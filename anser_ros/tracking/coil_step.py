@@ -145,8 +145,13 @@ def _take_errors_of(coils, positions, axes, lengths, flux, memory, model):  # ty
     )  # fmt: skip
     for c in range(count):
         s = coils[c]
-        memory.errors[s], memory.whitening[s] = errors[c], whitening[c]
-        memory.error_at[s, :3], memory.error_at[s, 3:] = positions[c], axes[c]
+        for k in range(width):  # assigned as arrays, they take 2 s more to be compiled
+            for r in range(rank):
+                memory.errors[s, r, k] = errors[c, r, k]
+            for j in range(width):
+                memory.whitening[s, k, j] = whitening[c, k, j]
+        for i in range(3):
+            memory.error_at[s, i], memory.error_at[s, 3 + i] = positions[c, i], axes[c, i]
         far = near[c, 0] if rank > 0 else positions[c, 2]  # over the board's own plane
         memory.reach_m[s] = ERROR_REACH * far if is_finite else -1.0
         memory.among[s] = near[c, 1]

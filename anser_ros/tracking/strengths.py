@@ -56,12 +56,16 @@ def go_on(mean, covariance, seconds, rate, keep):  # type: ignore[no-untyped-def
     Of rates ``keep`` is left, and what is new makes their deviation ``rate`` in the long run, 1/s.
     """
     width = mean.size // 2
-    mean[:width] += seconds * mean[width:]
-    mean[width:] *= keep
-    covariance[:width] += seconds * covariance[width:]
-    covariance[width:] *= keep
-    covariance[:, :width] += seconds * covariance[:, width:]
-    covariance[:, width:] *= keep
+    for i in range(width):
+        mean[i] += seconds * mean[width + i]
+        mean[width + i] *= keep
+        for j in range(2 * width):
+            covariance[i, j] += seconds * covariance[width + i, j]
+            covariance[width + i, j] *= keep
+    for i in range(2 * width):
+        for j in range(width):
+            covariance[i, j] += seconds * covariance[i, width + j]
+            covariance[i, width + j] *= keep
     for i in range(width, 2 * width):
         covariance[i, i] += rate * rate * (1.0 - keep * keep)
 
@@ -78,7 +82,9 @@ def learn_strengths(  # type: ignore[no-untyped-def]
     """
     width, size = flux.shape[1], flux.size
     white = np.zeros((7 + width, size))
-    white[:7] = rows[:7]
+    for i in range(7):
+        for k in range(size):
+            white[i, k] = rows[i, k]
     for s in range(flux.shape[0]):
         for k in range(0, width, 2):
             for i in range(2):
@@ -90,7 +96,7 @@ def learn_strengths(  # type: ignore[no-untyped-def]
     across, pose = square[:, 1:7].copy(), square[1:7, 1:7].copy()
     for i in range(6):
         pose[i, i] *= 1.0 + SOFT
-    square -= np.dot(across, np.linalg.solve(pose, across.T.copy()))
+    square -= np.dot(np.dot(across, np.linalg.inv(pose)), across.T)
     information, known = square[7:, 7:].copy(), covariance[:width, :width].copy()
     score, before = square[7:, 0] - np.dot(information, away), np.linalg.inv(known)
     chi2 = square[0, 0] - np.dot(away, square[7:, 0] + score)

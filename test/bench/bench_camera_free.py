@@ -18,8 +18,8 @@ from pathlib import Path
 import harness
 import matplotlib.pyplot as plt
 import numpy as np
-from chain import beginning
 from scipy.spatial.transform import Rotation
+from shortened import beginning
 
 from anser_ros.cli.page import legend_under
 from anser_ros.sessions.session import load_session
