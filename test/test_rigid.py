@@ -15,13 +15,17 @@ from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.rigid import (
     BodyCoils,
     carried_on,
-    common_factor,
     fill_common,
     solve_body,
     start_from_coils,
 )
 from anser_ros.tracking.solve import RealField, bounded_inverse
-from anser_ros.tracking.solve_context import NOT_FINITE, fill_model_errors, source_spacing
+from anser_ros.tracking.solve_context import (
+    NOT_FINITE,
+    build_context,
+    fill_model_errors,
+    source_spacing,
+)
 from anser_ros.tracking.tracker import Tracker
 
 SEED = 41
@@ -31,17 +35,23 @@ WIDTH = FIELD.moments.shape[1]
 TOOL = triaxial_tool()
 COILS = BodyCoils(TOOL.position, TOOL.axis, TOOL.length)
 WEIGHTS = np.full(WIDTH, 1 / NOISE_T)
-NOTHING = common_factor(np.zeros((9, 0, WIDTH)), WEIGHTS)
-LOW, HIGH = (corner + sign * 0.03 for corner, sign in zip(TrackedVolume().grown(0.03), (-1, 1),
-                                                           strict=True))  # fmt: skip
+ARRAYS = build_context(MODEL, TrackerSettings(flux_noise_t=NOISE_T)).arrays
 
 
 def real(flux):
     return np.ascontiguousarray(flux).view(np.float64)
 
 
-def solve(flux, position, rotation, common=NOTHING, coils=COILS):
-    return solve_body(FIELD, coils, real(flux), WEIGHTS, common, position, rotation, LOW, HIGH)
+def solve(flux, position, rotation, coils=COILS, model=ARRAYS):
+    return solve_body(coils, real(flux), model, position, rotation)
+
+
+def is_common(common, modes):
+    """Whether E is that of modes D (R, S 2K): ``I - E^T E`` is the inverse of ``I + D^T D``."""
+    expected = np.linalg.inv(np.eye(modes.shape[1]) + modes.T @ modes)
+    np.testing.assert_allclose(
+        np.eye(modes.shape[1]) - common.T @ common, expected, rtol=1e-7, atol=1e-9
+    )
 
 
 def nearby(rng, position, rotation, move=0.01, turn=0.2):
@@ -96,12 +106,8 @@ def test_errors_that_all_coils_share_do_not_average_out(rng):
     """The whole model off by one per cent: nine coils know no better than their model."""
     position, rotation = random_pose(rng)
     clean = fluxes(MODEL, TOOL, position, rotation)
-    modes = 0.01 * real(clean)[:, None]
-    common = common_factor(modes, WEIGHTS)
-    white = (modes[:, 0] * WEIGHTS).reshape(1, -1)
-    expected = np.linalg.inv(np.eye(white.size) + white.T @ white)
-    np.testing.assert_allclose(np.eye(white.size) - common.T @ common, expected, atol=1e-9)
-    found = solve(1.01 * clean, *nearby(rng, position, rotation, 1e-3, 0.01), common=common)
+    coils = replace(COILS, changes=np.full((1, 9), 0.01))
+    found = solve(1.01 * clean, *nearby(rng, position, rotation, 1e-3, 0.01), coils)
     assert found.chi2 < 3.0
     assert np.linalg.norm(found.position - position) < 3 * np.sqrt(
         np.trace(bounded_inverse(found.information)[:3, :3])
@@ -126,8 +132,7 @@ def test_what_coils_have_in_common_is_what_each_error_makes_of_them(rng):
         position, rotation, COILS.offsets, COILS.axes, COILS.lengths, changes, flux,
         columns_of(MODEL), modes.reshape(len(modes), -1), 1.0 / WEIGHTS, strengths, out,
     )  # fmt: skip
-    expected = common_factor(np.concatenate(each, axis=1), WEIGHTS)
-    np.testing.assert_allclose(out, expected, rtol=1e-7, atol=1e-9)
+    is_common(out, np.concatenate(np.concatenate(each, axis=1) * WEIGHTS, axis=1))
 
 
 def test_motion_is_carried_on_as_it_was(rng):
@@ -164,7 +169,10 @@ def test_refusals():
     with pytest.raises(TrackingError, match='9 coils'):
         solve(np.zeros((8, 8), complex), np.zeros(3), np.eye(3))
     with pytest.raises(TrackingError, match='must be finite'):
-        common_factor(np.full((9, 1, WIDTH), np.nan), WEIGHTS)
+        uncertain = ARRAYS._replace(
+            uncertain=ARRAYS.columns, modes=np.full((len(MODEL.positions), WIDTH), np.nan)
+        )
+        solve(np.ones((9, 8), complex), np.array([0.0, 0.0, 0.1]), np.eye(3), COILS, uncertain)
 
 
 POINT, AXIS = np.array([0.02, -0.05, 0.13]), np.array([0.6, 0.0, 0.8])

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +12,13 @@ from tracking_world import NOISE_T, fluxes, random_pose
 from anser_ros import pose_states as states
 from anser_ros.errors import TrackingError
 from anser_ros.field.model import EffectRecord, OpenArm, from_document, to_document
-from anser_ros.tracking.estimate import NO_GATE, NoiseScale, TrackerSettings
+from anser_ros.tracking.estimate import (
+    FRESH_NOISE,
+    NO_GATE,
+    TrackerSettings,
+    add_frame,
+    scale_of_frame,
+)
 from anser_ros.tracking.tracker import Tracker
 
 SEED = 51
@@ -232,16 +239,19 @@ def test_hostile_fluxes_never_make_a_pose(rng):
 
 
 def test_a_misfit_that_lasts_from_frame_to_frame_is_no_noise(rng):
-    noisy, wrong, among_metal = NoiseScale(), NoiseScale(), NoiseScale()
+    scales, last = np.tile(FRESH_NOISE, (3, 1)), np.zeros((3, 16))
     misfit = np.sqrt(11.0 / 16.0) * rng.choice([-1.0, 1.0], 16)
     for _ in range(1000):
         noise = np.sqrt(11.0 / 16.0) * rng.normal(size=16)
-        noisy.add(4.0, 2.0 * noise, 11)
-        wrong.add(4.0, noise + np.sqrt(3.0) * misfit, 11)
-        among_metal.add(0.9, 0.5 * misfit, 11)
+        white = np.stack([2.0 * noise, noise + np.sqrt(3.0) * misfit, 0.5 * misfit])
+        lasting = (last * white).sum(axis=1) / 11
+        for scale, ratio, product in zip(scales, (4.0, 4.0, 0.9), lasting, strict=True):
+            add_frame.py_func(scale, ratio, product)
+        last = white
+    noisy, wrong, among_metal = (partial(scale_of_frame.py_func, scale) for scale in scales)
     usual = 17.3 / 11.0
-    assert noisy.of_frame(4.0, usual, 2.2, 0.0, False) == pytest.approx(4.0, rel=0.01)
+    assert noisy(4.0, usual, 2.2, 0.0, False) == pytest.approx(4.0, rel=0.01)
     for ratio in (1.0, 4.0):  # what the frames before had, this one has too
-        assert wrong.of_frame(ratio, usual, 2.2, 0.0, False) > 10.0
-    stated = among_metal.of_frame(0.9, usual, 2.2, 0.25, True)
+        assert wrong(ratio, usual, 2.2, 0.0, False) > 10.0
+    stated = among_metal(0.9, usual, 2.2, 0.25, True)
     assert stated == pytest.approx(1.0 + 0.25 * 3.0, rel=1e-6), 'the model states it'

@@ -408,7 +408,8 @@ class FieldModel:
         its coils has turned it, about what the scan did not turn. A pose is off by what these are
         now beside that: by nothing where the body is turned as it was.
         """
-        known, arm = np.diag([self.shift_sigma_m**2] * 3 + [0.0] * 3), self.open_arms.get(body)
+        known, arm = np.zeros((6, 6)), self.open_arms.get(body)
+        known.flat[:21:7] = self.shift_sigma_m**2
         if arm is None or rotation is None:
             return known
         away = arm.turn - rotation

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from anser_ros.arrays import Array, Booleans
+from anser_ros.arrays import Array
 from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.rotations import fill_tangent
 from anser_ros.settings import ToolSettings
@@ -213,11 +213,6 @@ SURVEYS = 6.0
 """The same in stated errors of the survey, if that is more: one of 1e7 coils is so far off."""
 
 
-def allowed_m(sigma_m: float, survey_m: float) -> float:
-    """Return how far, m, a coil may be off its place in the body by its sigma and the survey's."""
-    return max(BODY_SIGMAS * sigma_m, HARMFUL_M, SURVEYS * survey_m)
-
-
 APART_M = 1e-3
 """Coils nearer to each other than this, m, are at one place of a tool, and no bend parts them."""
 FAILS_ALONE, IS_BENT = 1e-2, 1e-4
@@ -268,19 +263,22 @@ def _squared_distance(covariance, apart):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def fill_distances(  # type: ignore[no-untyped-def]
+def distances(  # type: ignore[no-untyped-def]
     position, rotation, covariance, offsets, axes, positions, directions, covariances, took_part,
-    survey, found,
+    survey,
 ):  # fmt: skip
-    """Write how far each coil is from its place in the body, ``found`` (3, S).
+    """Return how far each coil's own pose is from its place in the body, (4, S).
 
-    The rows are the squared Mahalanobis distance, the distance, m, and the angle, rad.
+    The rows are the squared Mahalanobis distance, the distance, m, the angle between the axes,
+    rad, and whether one of the distances is more than errors make.
 
     ``position`` (3,), ``rotation`` (3, 3), ``covariance`` (6, 6): the body's. ``offsets``,
     ``axes`` (S, 3): the coils in the body. ``positions``, ``directions`` (S, 3), ``covariances``
-    (S, 6, 6): what the coils say. ``took_part`` (S,). ``survey`` (3,): m, rad, relative gain, of
-    which a third seems to be a change of the distance: a field falls with its third power.
+    (S, 6, 6): what the coils say. ``took_part`` (S,): whether the body's pose made use of the
+    coil. ``survey`` (3,): m, rad, relative gain, of which a third seems to be a change of the
+    distance: a field falls with its third power.
     """
+    found = np.empty((4, offsets.shape[0]))
     t, slopes, total = np.empty((2, 3)), np.zeros((2, 5, 6)), np.empty((5, 5))
     apart, arm, n, cross = np.empty(5), np.empty(3), np.empty(3), np.empty(3)
     for s in range(offsets.shape[0]):
@@ -314,27 +312,10 @@ def fill_distances(  # type: ignore[no-untyped-def]
             _add_product(slopes[way], covariances[s] if way == 0 else covariance, total)
         found[1, s] = math.sqrt(apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2)
         found[0, s], found[2, s] = _squared_distance(total, apart), angle
-
-
-def distances(
-    body: tuple[Array, Array, Array],
-    offsets: Array,
-    axes: Array,
-    coils: tuple[Array, Array, Array],
-    took_part: Booleans,
-    tools: ToolSettings,
-) -> Array:
-    """Return how far each coil's own pose is from its place in the body, (3, S).
-
-    The squared Mahalanobis distance, to be compared with `GATE`; the distance, m; the angle
-    between the axes, rad. ``body`` is position (3,), rotation (3, 3) and covariance (6, 6), m and
-    rad, frame fg; ``offsets`` and ``axes`` (S, 3) are the coils' in the body; ``coils`` are the
-    positions (S, 3), axes (S, 3) and covariances (S, 6, 6) that they say of themselves;
-    ``took_part`` (S,) is whether the body's pose made use of the coil.
-    """
-    found = np.empty((3, len(offsets)))
-    survey = tools.tool_coil_position_m, tools.tool_coil_axis_rad, tools.tool_coil_gain
-    fill_distances(*body, offsets, axes, *coils, took_part, np.array(survey), found)
+        own = covariances[s]
+        sigma_m = math.sqrt(own[0, 0] + own[1, 1] + own[2, 2])
+        allowed_m = max(BODY_SIGMAS * sigma_m, HARMFUL_M, SURVEYS * survey[0])
+        found[3, s] = not (found[0, s] <= GATE and found[1, s] <= allowed_m)
     return found
 
 

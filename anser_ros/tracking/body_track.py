@@ -1,7 +1,6 @@
 """Follows a rigid tool through time by all of its usable coils, without those that disagree."""
 
-import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,19 +10,17 @@ from anser_ros.arrays import Array, Integers
 from anser_ros.errors import TrackingError
 from anser_ros.integrity.pose_checks import is_part
 from anser_ros.stamps import NANO
-from anser_ros.tracking import rigid
-from anser_ros.tracking.coil_step import MOST_STEPS, SUSPICIOUS_JUMP_M
+from anser_ros.tracking import body_step, rigid
+from anser_ros.tracking.body_step import UNKNOWNS
+from anser_ros.tracking.coil_step import Rules
 from anser_ros.tracking.coil_track import CoilResult
-from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings
+from anser_ros.tracking.estimate import PoseEstimate
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve_context import NOT_FINITE
 from anser_ros.tracking.solve_verdict import RARE, SYSTEMATIC, Freedom, SolveFrame, usual_and_most
 
 DISAGREES = 4.0
 """A coil is left out when its share of the misfit is so many times the mean of the others'."""
-
-UNKNOWNS = 6
-"""Numbers that a body's pose has."""
 
 SAME_TURN = 0.1
 """Two poses whose rotation matrices differ by no more (Frobenius norm: 0.1 is 4 deg) are one, as
@@ -39,60 +36,30 @@ Start = tuple[Array, Array]
 """A position, and a unit axis or a rotation matrix."""
 
 
-@dataclass
-class Track:
-    """Remembers the last two good solutions of one thing, and its noise scale."""
-
-    good: rigid.BodySolution | None = None
-    good_ns: int = 0
-    before: tuple[int, rigid.BodySolution] | None = None
-    noise: NoiseScale = field(default_factory=NoiseScale)
-
-    def forget(self) -> None:
-        """Drop the last poses, so that the next solve starts cold."""
-        self.good = self.before = None
-
-    def fresh(self, stamp_ns: int, settings: TrackerSettings) -> rigid.BodySolution | None:
-        """Return the last good solution; None where there is none, or it is too old."""
-        return self.good if (stamp_ns - self.good_ns) * NANO <= settings.warm_age_s else None
-
-    def steps(self, stamp_ns: int) -> float:
-        """Return how many of the last good step's durations have passed since; 0 for too many."""
-        if self.before is None:
-            return 0.0
-        steps = (stamp_ns - self.good_ns) / max(self.good_ns - self.before[0], 1)
-        return steps if 0.0 < steps <= MOST_STEPS else 0.0
-
-    def remember(self, solution: rigid.BodySolution, stamp_ns: int) -> None:
-        """Take in a good solution."""
-        last, self.before = self.good, None
-        if last is not None and math.dist(last.position, solution.position) < SUSPICIOUS_JUMP_M:
-            self.before = (self.good_ns, last)
-        self.good, self.good_ns = solution, stamp_ns
-
-
-@dataclass
-class BodyTrack(Track):
+class BodyTrack:
     """Remembers one body: its last good poses, its noise scale, the coils that disagreed."""
 
-    left_out: frozenset[int] = frozenset()
-    again_ns: int = 0
+    def __init__(self) -> None:
+        self.memory = body_step.BodyMemory.empty()
+        self.left_out: frozenset[int] = frozenset()
+        self.again_ns = 0
 
     def forget(self) -> None:
-        """Drop the last poses, so that the next solve starts cold."""
-        super().forget()
+        """Drop the last poses, so that the next solves start cold."""
+        self.memory.last[:] = 0
         self.left_out = frozenset()
 
-    def expected(self, good: rigid.BodySolution, stamp_ns: int) -> Start:
-        """Return where the body is if it moves on as it did between its last two good poses."""
-        steps = self.steps(stamp_ns)
-        if self.before is None or steps == 0.0:
-            return good.position, good.rotation
-        old = self.before[1]
-        start: Start = rigid.carried_on(
-            good.position, good.rotation, old.position, old.rotation, steps
-        )
-        return start
+    def note(self, frame: 'BodyFrame', fit: 'BodyFit') -> None:
+        """Keep the residuals of a good solution; note which coils were left out of it."""
+        self.memory = self.memory._replace(whitened=fit.solution.whitened)
+        left_out: frozenset[int] = frozenset()
+        if len(fit.used) < len(frame.usable):
+            kept = fit.used.tolist()
+            left_out = frozenset(frame.usable.tolist()).difference(kept)
+            if is_part(frame.coils.offsets, left_out, kept):
+                left_out = frozenset()  # the body waits for it, and asks again in the next frame
+        if left_out != self.left_out:
+            self.left_out, self.again_ns = left_out, frame.stamp_ns + round(LEFT_OUT_S / NANO)
 
 
 @dataclass(frozen=True)
@@ -130,71 +97,40 @@ class BodyResult:
 class BodyFrame(SolveFrame):
     """Holds a body's fluxes (S, 2K), its coils, and what each of these found by itself.
 
-    ``own`` are positions (S, 3), m, axes (S, 3) and normal matrices (S, 6, 6) of their solutions.
+    ``own`` are positions (S, 3), m, axes (S, 3) and normal matrices (S, 6, 6) of their solutions,
+    ``rules`` those that coils were judged by.
     """
 
     coils: rigid.BodyCoils
     single: list[CoilResult]
     own: tuple[Array, Array, Array]
+    rules: Rules
 
-    @property
+    @cached_property
     def usable(self) -> Integers:
         """Return the indices of the coils that the body may use."""
         return np.flatnonzero([coil.usable for coil in self.single])
 
+    def freedom(self, used: Integers) -> Freedom:
+        """Return what the readings of some coils leave to the body's pose."""
+        size, readings = len(used) * self.flux.shape[1], len(used) * self.context.readings
+        return Freedom(max(size - UNKNOWNS, 1), UNKNOWNS, RARE, readings - UNKNOWNS)
+
     @cached_property
-    def inverse_sigma(self) -> Array:
-        """Return the inverse of each sigma, 1/T, shape (2K,)."""
-        return 1.0 / self.context.sigma
-
-    def checks(self, used: Integers) -> int:
-        """Return how many readings of some coils are beyond the pose's unknowns."""
-        return len(used) * self.context.readings - UNKNOWNS
-
-    def common(self, used: Integers, start: Start, strengths: Array | None = None) -> Array:
-        """Return what some coils' errors have in common, see `fill_common`.
-
-        Errors of the emitters' ``strengths`` are those of the context unless others are given.
-        """
-        coils, of, flux = self.coils.subset(used), self.context.arrays, self.flux[used]
-        strengths = of.strengths if strengths is None else strengths
-        changes = coils.gain_changes
-        rank = of.modes.shape[1] // flux.shape[1] + len(changes) + strengths.shape[1]
-        out = np.empty((rank, flux.size))
-        if not rigid.fill_common(
-            *start, coils.offsets, coils.axes, coils.lengths, changes, flux, of.uncertain,
-            of.modes, of.sigma, strengths, out,
-        ):  # fmt: skip
-            raise TrackingError(NOT_FINITE)
-        return out
-
-    def nearer(self, start: Start, used: Integers) -> Start:
-        """Return a start moved to where the coils' own good poses agree best."""
-        good = [i for i in used.tolist() if self.single[i].estimate.state == states.OK]
-        coils, own = self.coils, self.own
-        if len(good) < len(coils.axes):
-            coils, own = (
-                coils.subset(np.array(good, np.int64)),
-                (own[0][good], own[1][good], own[2][good]),
-            )
-        if not coils.observable:
-            return start
-        nearer: Start = rigid.step_to_coils(
-            *start, coils.offsets, coils.axes, *own,
-            self.context.low - coils.reach, self.context.high + coils.reach,
-        )  # fmt: skip
-        return nearer
+    def good(self) -> Integers:
+        """Return the coils whose own poses tell where the body is; none where they don't."""
+        good = np.array(
+            [i for i in self.usable.tolist() if self.single[i].estimate.state == states.OK],
+            dtype=np.int64,
+        )
+        return good if self.coils.subset(good).observable else good[:0]
 
 
 def solve_with(frame: BodyFrame, used: Integers, start: Start) -> BodyFit:
     """Return the fit of some of a body's coils from a start near it."""
     part, context = frame.coils.subset(used), frame.context
-    flux = frame.flux[used]
-    solution = rigid.solve_body(
-        context.field, part, flux, frame.inverse_sigma, frame.common(used, start), *start,
-        context.low - part.reach, context.high + part.reach,
-    )  # fmt: skip
-    return BodyFit(solution, used, max(flux.size - UNKNOWNS, 1))
+    solution = rigid.solve_body(part, frame.flux[used], context.arrays, *start)
+    return BodyFit(solution, used, frame.freedom(used).of_residual)
 
 
 def _without_disagreeing(fit: BodyFit, frame: BodyFrame, gate: float) -> BodyFit:
@@ -210,7 +146,7 @@ def _without_disagreeing(fit: BodyFit, frame: BodyFrame, gate: float) -> BodyFit
         worst = int(np.argmax(misfit))
         others = np.delete(misfit, worst)
         rest = np.delete(fit.used, worst)
-        if frame.checks(rest) <= 0 or not frame.coils.subset(rest).observable:
+        if frame.freedom(rest).checks <= 0 or not frame.coils.subset(rest).observable:
             break
         if misfit[worst] < DISAGREES * others.mean():
             break
@@ -247,7 +183,12 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
         bad = (c.estimate.state for c in frame.single if not c.usable)
         worst = next((state for state in bad if state != states.OK), states.AMBIGUOUS)
         return BodyResult(frame.no_pose(worst, reason))
-    fits = _from_good(track, frame, used)
+    fit, estimate = _follow(track, frame)
+    if fit is not None and estimate is not None:
+        return BodyResult(estimate, fit, fit.solution.gain)
+    if fit is not None:
+        fit = _without_disagreeing(fit, frame, gate)
+    fits = [fit] if fit is not None and fit.good(gate) else []
     continues = bool(fits)
     if not fits:
         fits = [solve_with(frame, used, start) for start in _cold_starts(frame, used)]
@@ -261,14 +202,53 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
     fit = fits[0]
     result, gain = _judge(track, frame, fit, fits[1:], continues)
     if result.state == states.OK:
-        track.remember(fit.solution, frame.stamp_ns)
-        track.noise.add(fit.ratio, fit.solution.whitened, fit.freedom)
-        left_out = frozenset(used.tolist()) - frozenset(fit.used.tolist())
-        if is_part(coils.offsets, left_out, fit.used.tolist()):
-            left_out = frozenset()  # the body waits for it, and asks again in the next frame
-        if left_out != track.left_out:
-            track.left_out, track.again_ns = left_out, frame.stamp_ns + round(LEFT_OUT_S / NANO)
+        found = fit.solution
+        body_step.remember(
+            frame.stamp_ns, found.position, found.rotation, fit.ratio, found.whitened,
+            fit.freedom, track.memory,
+        )  # fmt: skip
+        track.note(frame, fit)
     return BodyResult(result, fit, gain)
+
+
+def _follow(track: BodyTrack, frame: BodyFrame) -> tuple[BodyFit | None, PoseEstimate | None]:
+    """The fit near the last good pose, if there is one, and its estimate if it is sound."""
+    whole, coils, context, stamp_ns = frame.usable, frame.coils, frame.context, frame.stamp_ns
+    tries, last_ns, fit = [whole], int(track.memory.last[0]), None
+    if not last_ns or (stamp_ns - last_ns) * NANO > frame.settings.warm_age_s:
+        return None, None
+    if track.left_out and stamp_ns < track.again_ns:
+        kept = np.array([i for i in whole.tolist() if i not in track.left_out], dtype=np.int64)
+        if len(kept) > 1 and coils.subset(kept).observable:
+            tries.insert(0, kept)
+    for used in tries:
+        freedom, is_whole = frame.freedom(used), len(used) == len(whole)
+        is_finite, is_sound, covariance, residual_t, solution = body_step.follow_body(
+            stamp_ns, frame.flux, coils.arrays, used, is_whole, frame.own, frame.good,
+            track.memory, context.arrays, context.middle, frame.rules,
+            usual_and_most(frame.settings, freedom),
+        )  # fmt: skip
+        if not is_finite:
+            raise TrackingError(NOT_FINITE)
+        fit = BodyFit(solution, used, freedom.of_residual)
+        if used is whole:
+            track.again_ns = stamp_ns + round(LEFT_OUT_S / NANO)
+        if is_sound and is_whole:
+            track.note(frame, fit)
+            return fit, PoseEstimate(
+                frame.name, stamp_ns, states.OK, solution.position,
+                solution.rotation[:, 2].copy(), solution.rotation, covariance, residual_t,
+                fit.ratio, context.model_id, _left_out(frame, fit), freedom.checks,
+            )  # fmt: skip
+        if fit.good(frame.settings.gate):
+            break
+    return fit, None
+
+
+def _left_out(frame: BodyFrame, fit: BodyFit) -> str:
+    """How many coils were not used; empty for none."""
+    left_out = len(frame.single) - len(fit.used)
+    return f'{left_out} of {len(frame.single)} coils left out' if left_out else ''
 
 
 OTHER_SIDES = -np.ones(3), np.array([1.0, 1.0, -1.0])
@@ -294,24 +274,6 @@ def _on_other_sides(frame: BodyFrame, fit: BodyFit) -> list[BodyFit]:
     return found
 
 
-def _from_good(track: BodyTrack, frame: BodyFrame, used: Integers) -> list[BodyFit]:
-    """The fit near the last good pose, when there is one that passes the gate."""
-    stamp_ns, gate = frame.stamp_ns, frame.settings.gate
-    good = track.fresh(stamp_ns, frame.settings)
-    if good is None:
-        return []
-    start = frame.nearer(track.expected(good, stamp_ns), used)
-    if track.left_out and stamp_ns < track.again_ns:
-        kept = np.array([i for i in used if int(i) not in track.left_out], dtype=np.int64)
-        if len(kept) > 1 and frame.coils.subset(kept).observable:
-            fit = solve_with(frame, kept, start)
-            if fit.good(gate):
-                return [fit]
-    track.again_ns = stamp_ns + round(LEFT_OUT_S / NANO)
-    fit = _without_disagreeing(solve_with(frame, used, start), frame, gate)
-    return [fit] if fit.good(gate) else []
-
-
 def _judge(
     track: BodyTrack, frame: BodyFrame, fit: BodyFit, rivals: list[BodyFit], continues: bool
 ) -> tuple[PoseEstimate, float]:
@@ -325,22 +287,20 @@ def _judge(
         for rival in rivals
         if rival.solution.converged and _apart(rival.solution, solution)
     )
-    freedom = Freedom(fit.freedom, UNKNOWNS, RARE, frame.checks(fit.used))
+    freedom = frame.freedom(fit.used)
     usual, _ = usual_and_most(frame.settings, freedom)
     if fit.ratio > usual and len(fit.used) < len(frame.usable):
         # Some disagreed, and the others do not agree without them.
         covariance = SYSTEMATIC * covariance
     estimate = frame.estimate(
-        track.noise, solution, freedom,
+        track.memory.noise, solution, freedom,
         (position, rotation[:, 2].copy(), rotation), lambda scale: covariance + by_gain / scale,
         others,
         position + rotation @ frame.coils.subset(fit.used).middle,
         continues=continues,
     )  # fmt: skip
-    left_out = len(frame.single) - len(fit.used)
-    if estimate.state == states.OK and left_out:
-        reason = f'{left_out} of {len(frame.single)} coils left out'
-        estimate = replace(estimate, reason=reason)
+    if estimate.state == states.OK:
+        estimate = replace(estimate, reason=_left_out(frame, fit))
     return estimate, gain
 
 

@@ -50,7 +50,7 @@ class CoilMemory(NamedTuple):
     # good, before: (S, 6), position, m, and unit axis of these poses, frame fg
     good: Array
     before: Array
-    noise: Array  # (S, 4), see `NoiseScale`
+    noise: Array  # (S, 4), see `FRESH_NOISE`
     whitened: Array  # (S, 2K), residuals at the last good pose, in sigmas; NaN for none
     # What the model's uncertainty does to a coil at a pose, and is reused while the coil is near
     error_at: Array  # (S, 6), the pose
@@ -114,19 +114,28 @@ UNKNOWN = -1
 
 
 @inlined
-def _distance(one, other):  # type: ignore[no-untyped-def]
+def distance(one, other):  # type: ignore[no-untyped-def]
     """Return the distance of two points."""
     x, y, z = one[0] - other[0], one[1] - other[1], one[2] - other[2]
     return math.sqrt(x * x + y * y + z * z)
 
 
 @inlined
+def is_inside(place, rules):  # type: ignore[no-untyped-def]
+    """Return whether a place (3,), m, is in the volume."""
+    inside = True
+    for i in range(3):
+        inside &= rules.low[i] <= place[i] <= rules.high[i]
+    return inside
+
+
+@inlined
 def _knows_errors(s, position, axis, memory, model):  # type: ignore[no-untyped-def]
     """Return whether the error that is remembered for coil ``s`` is that at a pose, too."""
     at = memory.error_at[s]
-    is_near = _distance(position, at[:3]) < memory.reach_m[s]
+    is_near = distance(position, at[:3]) < memory.reach_m[s]
     is_certain = model.modes.shape[0] == 0 and model.strengths.shape[0] == 0
-    return is_certain or (is_near and _distance(axis, at[3:]) < ERROR_REACH)
+    return is_certain or (is_near and distance(axis, at[3:]) < ERROR_REACH)
 
 
 @inlined
@@ -190,7 +199,7 @@ def remember(s, stamp_ns, position, axis, residual, ratio, freedom, memory):  # 
         last[k] = white
     add_frame(memory.noise[s], ratio, lasting if has_last else 0.0)
     good, before = memory.good[s], memory.before[s]
-    moved = memory.good_ns[s] == 0 or _distance(good, position) >= SUSPICIOUS_JUMP_M
+    moved = memory.good_ns[s] == 0 or distance(good, position) >= SUSPICIOUS_JUMP_M
     memory.before_ns[s] = 0 if moved else memory.good_ns[s]
     memory.good_ns[s] = stamp_ns
     for i in range(3):
@@ -234,12 +243,9 @@ def _judge_coil(s, memory, model, rules, out):  # type: ignore[no-untyped-def]
     for value in out.residual[s]:
         power += value * value
     out.residual_t[s] = math.sqrt(power / out.residual.shape[1])
-    is_inside = True
-    for i in range(3):
-        is_inside &= rules.low[i] <= position[i] <= rules.high[i]
     most_m = rules.max_sigma_m * sigma_factor(rules.has_gate, scale)
     in_metal = memory.among[s] > 1.0 and rules.has_gate
-    return fault_of(ratio, rules.gate, is_inside, True, sigma_m, most_m, in_metal)
+    return fault_of(ratio, rules.gate, is_inside(position, rules), True, sigma_m, most_m, in_metal)
 
 
 @kernel(nogil=True)
@@ -284,7 +290,7 @@ def follow_coils(stamp_ns, values, sound, lengths, memory, model, rules, out):  
         )  # fmt: skip
         ratio = out.found[s, 0] / rules.freedom
         is_confirmed = not ratio > rules.gate * rules.gate and out.found[s, 2] != 0.0
-        if not is_confirmed or _distance(position, memory.good[s]) > SUSPICIOUS_JUMP_M:
+        if not is_confirmed or distance(position, memory.good[s]) > SUSPICIOUS_JUMP_M:
             continue
         out.fault[s] = _judge_coil(s, memory, model, rules, out)
         if out.fault[s] == SOUND:

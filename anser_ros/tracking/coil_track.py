@@ -17,11 +17,11 @@ from anser_ros.arrays import Array, Booleans
 from anser_ros.errors import TrackingError
 from anser_ros.stamps import NANO
 from anser_ros.tracking import coil_step
-from anser_ros.tracking.estimate import FRESH_NOISE, NoiseScale, PoseEstimate, TrackerSettings
+from anser_ros.tracking.estimate import FRESH_NOISE, PoseEstimate, TrackerSettings
 from anser_ros.tracking.seed import solve_cold
 from anser_ros.tracking.solve import CoilSolution, coil_covariance, solve_coil, whitening_of
 from anser_ros.tracking.solve_context import NOT_FINITE, ErrorModes, SolveContext
-from anser_ros.tracking.solve_verdict import Freedom, SolveFrame, millimetres
+from anser_ros.tracking.solve_verdict import SOUND, Freedom, SolveFrame, millimetres
 
 FIRST_RETRY_S, LAST_RETRY_S = 0.05, 0.25
 """Pauses after a scan without a good pose, s: the first one, which doubles from scan to scan, and
@@ -54,17 +54,18 @@ class Scans:
 class CoilTracks:
     """Remembers coils, a row each, and solves them near where they are expected.
 
-    ``freedom`` is what the readings of the last frame left to the pose of each.
+    ``freedom`` is what the readings of the last frame left to the pose of each, and ``rules`` are
+    those that its poses were judged by.
     """
 
     freedom: Freedom
+    rules: coil_step.Rules
 
     def __init__(self, count: int) -> None:
         self.scans = [Scans() for _ in range(count)]
         self._made_for: tuple[ErrorModes | None, Array, Array] | None = None
-        self._ruled: tuple[TrackerSettings, Freedom, coil_step.Rules] | None = None
+        self._ruled: tuple[TrackerSettings, Freedom] | None = None
         noise = np.tile(FRESH_NOISE, (count, 1))
-        self.noise = [NoiseScale(row) for row in noise]
         some, none = np.zeros((count, 6)), np.empty((count, 0, 0))
         stamps = np.zeros(count, dtype=np.int64)
         self.memory = coil_step.CoilMemory(
@@ -113,27 +114,31 @@ class CoilTracks:
         """Solve all coils near where they are expected; see `follow_coils`."""
         out, memory = coil_step.Followed.empty(*values.shape), self.prepare(context)
         ruled, freedom = self._ruled, coil_step.freedom_of(values.shape[1], context.readings)
-        self.freedom = freedom
         if ruled is None or ruled[0] is not settings or ruled[1] != freedom:
-            ruled = self._ruled = settings, freedom, coil_step.rules_of(settings, freedom)
+            self._ruled, self.freedom = (settings, freedom), freedom
+            self.rules = coil_step.rules_of(settings, freedom)
         if context.readings >= coil_step.UNKNOWNS and not coil_step.follow_coils(
-            stamp_ns, values, sound, lengths, memory, context.arrays, ruled[2], out
+            stamp_ns, values, sound, lengths, memory, context.arrays, self.rules, out
         ):
             raise TrackingError(NOT_FINITE)
         return out
 
     def followed(
-        self, row: int, name: str, stamp_ns: int, ended: coil_step.Followed, model_id: str
-    ) -> 'CoilResult':
-        """Return what `follow` found of a coil that is good where it was expected."""
-        self.scans[row].forget()
-        found, freedom = ended.solution(row), self.freedom
-        estimate = PoseEstimate(
-            name, stamp_ns, states.OK, found.position, found.axis, None, ended.covariance[row],
-            float(ended.residual_t[row]), found.chi2 / freedom.of_residual, model_id, '',
-            freedom.checks,
-        )  # fmt: skip
-        return CoilResult(estimate, found, False, bool(self.memory.among[row] > 1.0))
+        self, stamp_ns: int, names: Sequence[str], ended: coil_step.Followed, model_id: str
+    ) -> 'list[CoilResult | None]':
+        """Return what `follow` found of each coil; None where it is not good where expected."""
+        results: list[CoilResult | None] = [None] * len(names)
+        among, freedom = self.memory.among.tolist(), self.freedom
+        for i in np.flatnonzero(ended.fault == SOUND).tolist():
+            self.scans[i].forget()
+            found = ended.solution(i)
+            estimate = PoseEstimate(
+                names[i], stamp_ns, states.OK, found.position, found.axis, None,
+                ended.covariance[i], ended.residual_t.item(i), found.chi2 / freedom.of_residual,
+                model_id, '', freedom.checks,
+            )  # fmt: skip
+            results[i] = CoilResult(estimate, found, False, among[i] > 1.0)
+        return results
 
 
 @dataclass
@@ -266,7 +271,7 @@ def _judge(
         if rival.converged and settings.box.contains(rival.position)
     )
     return frame.estimate(
-        frame.tracks.noise[frame.row], solution, frame.freedom, (position, axis, None),
+        frame.tracks.memory.noise[frame.row], solution, frame.freedom, (position, axis, None),
         lambda scale: coil_covariance(solution.normal, axis, settings.roll_variance / scale),
         others, position, in_metal=frame.among_metal,
     )  # fmt: skip

@@ -120,7 +120,7 @@ class TrackerSettings:
         return float(sigma_factor.py_func(self.has_gate, scale))
 
 
-@dataclass(frozen=True)
+@dataclass  # Not frozen: it would take three times as long to make, ten times a frame
 class PoseEstimate:
     """Holds one sensor's or body's pose in one frame, or why there is none."""
 
@@ -162,13 +162,26 @@ def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) ->
 
 
 FRESH_NOISE = PRIOR_FRAMES, PRIOR_FRAMES, 0.0, 0.0
-"""State of a noise scale before the first frame: weight, power, and power that lasts, over many
-frames in units of the weight, and over few."""
+"""State (4,) of a noise scale before the first frame: weight, power, and power that lasts, over
+many frames in units of the weight, and over few.
+
+It estimates residual power over its expectation as frames pass: 1 when the noise is as stated. It
+is an exponential mean over about `MEMORY_FRAMES` good frames, that starts as if `PRIOR_FRAMES` had
+been as expected. Noise is new in each frame; what stays in the residuals is misfit."""
 
 
 @inlined
 def scale_of_frame(noise, ratio, usual, share, model_share, follows):  # type: ignore[no-untyped-def]
-    """Return one frame's variance scale, see `NoiseScale.of_frame`."""
+    """Return one frame's variance scale: the running one, or more if its residual asks for it.
+
+    ``ratio`` is its residual power over the expected one, and ``usual`` what noise seldom
+    exceeds; more comes from a bent field. ``share`` are degrees of freedom for each dimension of
+    the pose: what stays in the former of a bent field shows, as a power, what goes into the
+    latter. ``model_share`` of the expected residual is the model's own error. It bends the field
+    as metal does, and as much of it goes into the pose, however many readings there are. If the
+    model states its error by modes, which it ``follows``, no small residual takes that error off
+    the pose, and no lasting misfit is taken for noise.
+    """
     hidden, lasting = HIDDEN * share, noise[2] / noise[0]
     misfit = max(lasting - model_share - SLIGHT, 0.0)  # beyond the model's own error
     least = max(noise[1] / noise[0] - misfit, SLIGHT)
@@ -181,60 +194,16 @@ def scale_of_frame(noise, ratio, usual, share, model_share, follows):  # type: i
 
 @inlined
 def add_frame(noise, ratio, lasting):  # type: ignore[no-untyped-def]
-    """Take a good frame into the state (4,) of a noise scale, see `NoiseScale.add`.
+    """Take a good frame into the state (4,) of a noise scale, in place.
 
-    ``lasting`` is the product of its whitened residuals and the last frame's per freedom.
+    ``ratio`` is its residual power over the expected one, ``lasting`` the product of its whitened
+    residuals and the last frame's per freedom.
     """
     keep, most = 1.0 - 1.0 / MEMORY_FRAMES, 4.0 * noise[1] / noise[0]
     noise[0] = keep * noise[0] + 1.0
     noise[1] = keep * noise[1] + min(ratio, most)
     noise[2] = keep * noise[2] + min(lasting, most)
     noise[3] += (min(lasting, most) - noise[3]) / SUDDEN_FRAMES
-
-
-class NoiseScale:
-    """Estimates residual power over its expectation as frames pass: 1 when the noise is as stated.
-
-    An exponential mean over about `MEMORY_FRAMES` good frames; it starts as if `PRIOR_FRAMES` had
-    been as expected. Noise is new in each frame; what stays in the residuals from one frame to the
-    next is misfit. ``state`` (4,) is written over, as kernels do.
-    """
-
-    def __init__(self, state: Array | None = None) -> None:
-        self._state = np.array(FRESH_NOISE) if state is None else state
-        self._last: Array | None = None
-
-    @property
-    def value(self) -> float:
-        return float(self._state[1] / self._state[0])
-
-    def add(self, ratio: float, whitened: Array | None = None, freedom: int = 1) -> None:
-        """Take in one more good frame with its residual power over the expected one.
-
-        ``whitened`` (2K,) are residuals in units of their sigma, with so many degrees of freedom;
-        nothing is found to last without them.
-        """
-        last, self._last = self._last, whitened
-        lasting = 0.0
-        if last is not None and whitened is not None and last.shape == whitened.shape:
-            lasting = float(last @ whitened) / freedom
-        add_frame.py_func(self._state, ratio, lasting)
-
-    def of_frame(
-        self, ratio: float, usual: float, share: float, model_share: float, follows: bool
-    ) -> float:
-        """Return one frame's variance scale: the running one, or more if its residual asks for it.
-
-        ``ratio`` is its residual power over the expected one, and ``usual`` what noise seldom
-        exceeds; more comes from a bent field. ``share`` are degrees of freedom for each dimension
-        of the pose: what stays in the former of a bent field shows, as a power, what goes into the
-        latter. ``model_share`` of the expected residual is the model's own error. It bends the
-        field as metal does, and as much of it goes into the pose, however many readings there are.
-        If the model states its error by modes, which it ``follows``, no small residual takes that
-        error off the pose, and no lasting misfit is taken for noise.
-        """
-        state = self._state.tolist()
-        return float(scale_of_frame.py_func(state, ratio, usual, share, model_share, follows))
 
 
 @dataclass(frozen=True)

@@ -304,18 +304,13 @@ def _contradictions(
     own = [found[row] for row in body.rows[members].tolist()]
     coils, used = body.coils.subset(np.array(members)), set(fit.used.tolist())
     away = pose_checks.distances(
-        (estimate.position, fit.solution.rotation, estimate.covariance),
-        coils.offsets, coils.axes,
-        (
-            np.array([e.position for e in own]), np.array([e.axis for e in own]),
-            np.array([e.covariance for e in own]),
-        ),
-        np.array([i in used for i in members]),
-        tools,
+        estimate.position, fit.solution.rotation, estimate.covariance, coils.offsets, coils.axes,
+        np.array([e.position for e in own]), np.array([e.axis for e in own]),
+        np.array([e.covariance for e in own]), np.array([i in used for i in members]),
+        np.array([tools.tool_coil_position_m, tools.tool_coil_axis_rad, tools.tool_coil_gain]),
     )  # fmt: skip
-    against = {}
-    for i, one, (distance, away_m, angle) in zip(members, own, away.T.tolist(), strict=True):
-        allowed_m = pose_checks.allowed_m(one.sigma_position_m, tools.tool_coil_position_m)
-        if not (distance <= pose_checks.GATE and away_m <= allowed_m):
-            against[i] = pose_checks.reason(distance, away_m, angle)
-    return against
+    return {
+        i: pose_checks.reason(*one)
+        for i, (*one, is_against) in zip(members, away.T.tolist(), strict=True)
+        if is_against
+    }

@@ -36,6 +36,7 @@ from anser_ros.tracking.solve import (
     RealField,
     bounded_inverse,
 )
+from anser_ros.tracking.solve_context import NOT_FINITE, ModelArrays
 
 
 @inlined
@@ -287,9 +288,11 @@ class BodyCoils:
         )
 
     @cached_property
-    def gain_changes(self) -> Array:
-        """Return ``changes``, (0, S) where there are none."""
-        return np.empty((0, len(self.axes))) if self.changes is None else self.changes
+    def arrays(self) -> tuple[Array, Array, Array, Array]:
+        """Return all of it for the compiled steps; ``changes`` are (0, S) where there are none."""
+        none = np.empty((0, len(self.axes)))
+        changes = none if self.changes is None else self.changes
+        return self.offsets, self.axes, self.lengths, changes
 
 
 class BodySolution(NamedTuple):
@@ -315,7 +318,7 @@ class BodySolution(NamedTuple):
 def weigh(rows, common, information, coils):  # type: ignore[no-untyped-def]
     """Return the last five items of `BodySolution`, of so many coils.
 
-    ``common`` is from `common_factor`. What the gain may be off by is the root of the mean square
+    ``common`` is from `fill_common`. What the gain may be off by is the root of the mean square
     of its posterior beyond `LEAST_GAIN`: it has changed with a probability of `GAIN_CHANGES`, then
     by `COMMON_GAIN`.
     """
@@ -343,7 +346,7 @@ def weigh(rows, common, information, coils):  # type: ignore[no-untyped-def]
 
 @kernel
 def _factor(out):  # type: ignore[no-untyped-def]
-    """Turn modes D (R, n) into E, see `common_factor`; return False where they are not finite."""
+    """Turn modes D (R, n) into E, see `fill_common`; return False where they are not finite."""
     factor = np.dot(out, out.T)
     for i in range(out.shape[0]):
         for j in range(i + 1):
@@ -366,8 +369,9 @@ def fill_common(  # type: ignore[no-untyped-def]
     position, rotation, offsets, axes, lengths, changes, flux, dipoles, modes, sigma, strengths,
     out,
 ):  # fmt: skip
-    """Write E, see `common_factor`, of a body at a pose: errors of the model's moments, of gains
-    that coils have in common, and of the emitters' strengths, in this order.
+    """Write E (R, S 2K), ``(I + D^T D)^-1 = I - E^T E`` with whitened modes D of a body at a pose:
+    errors of one standard deviation each of the model's moments, of gains that coils have in
+    common, and of the emitters' strengths, in this order.
 
     A body learns how far each mode goes from what its coils differ by: those of places 6 mm
     aside, where a coil was before, make poses by a drawing wrong by 3.5 of their sigmas. The
@@ -394,47 +398,58 @@ def fill_common(  # type: ignore[no-untyped-def]
     return _factor(out)
 
 
-def common_factor(modes: Array, inverse_sigma: Array) -> Array:
-    """Return E (R, S 2K) with ``(I + D^T D)^-1 = I - E^T E`` for whitened modes D.
+@inlined
+def reach_of(offsets):  # type: ignore[no-untyped-def]
+    """Return the largest distance of coils (S, 3) from the tool's origin, m."""
+    most = 0.0
+    for s in range(offsets.shape[0]):
+        most = max(most, offsets[s, 0] ** 2 + offsets[s, 1] ** 2 + offsets[s, 2] ** 2)
+    return math.sqrt(most)
 
-    ``modes`` (S, R, 2K) are flux errors of one standard deviation each that several coils share,
-    T; ``inverse_sigma`` (2K,) is in 1/T. Raises `TrackingError` when the modes are not finite.
+
+@kernel
+def solve_near(position, rotation, coils, flux, model):  # type: ignore[no-untyped-def]
+    """Return whether the model's error is finite, and the `BodySolution` from a start near it.
+
+    ``coils`` are `BodyCoils.arrays`, ``flux`` (S, 2K), T, ``model`` is `SolveContext.arrays`.
     """
-    common = np.concatenate(modes * inverse_sigma, axis=1)
-    if not _factor(common):
-        raise TrackingError('the model covariance must be finite')
-    return common
+    offsets, axes, lengths, changes = coils
+    count, width = flux.shape
+    rank = model.modes.shape[1] // width + changes.shape[0] + model.strengths.shape[1]
+    common = np.empty((rank, flux.size))
+    is_finite = fill_common(
+        position, rotation, offsets, axes, lengths, changes, flux, model.uncertain, model.modes,
+        model.sigma, model.strengths, common,
+    )  # fmt: skip
+    reach, budget = reach_of(offsets), MAX_EVALUATIONS if is_finite else 1
+    chi2, converged, place, turn, residual, white, information = descend_body(
+        position.copy(), rotation.copy(), offsets, axes, lengths, flux, 1.0 / model.sigma, common,
+        model.columns, model.moments, model.low - reach, model.high + reach, budget,
+    )  # fmt: skip
+    coil_chi2, whitened, covariance, gain, carried = weigh(white, common, information, count)
+    return is_finite, BodySolution(
+        place, turn, chi2, information, residual, converged, white, coil_chi2, whitened,
+        covariance, gain, carried,
+    )  # fmt: skip
 
 
 def solve_body(
-    field: RealField,
-    coils: BodyCoils,
-    flux: Array,
-    inverse_sigma: Array,
-    common: Array,
-    position: NDArray[np.generic],
-    rotation: NDArray[np.generic],
-    low: Array,
-    high: Array,
+    coils: BodyCoils, flux: Array, model: ModelArrays, position: Array, rotation: Array
 ) -> BodySolution:
     """Fit a rigid tool's pose from a start near it.
 
-    ``flux`` (S, 2K) in T has real and imaginary part by turns, ``inverse_sigma`` (2K,) is in
-    1/T; ``common`` is from `common_factor`, without a row for a model without uncertainty. The
-    body's origin does not leave the box from ``low`` to ``high``, m. Raises `TrackingError` when
-    shapes don't fit.
+    ``flux`` (S, 2K) in T has real and imaginary part by turns. The body's origin does not leave
+    the model's box by more than its reach. Raises `TrackingError` when shapes don't fit, or the
+    model's errors are not finite.
     """
-    count, width = len(coils.offsets), field.moments.shape[1]
-    if flux.shape != (count, width) or inverse_sigma.shape != (width,):
+    count, width = len(coils.offsets), model.moments.shape[1]
+    if flux.shape != (count, width):
         raise TrackingError(f'{count} coils and {width} components, got flux {flux.shape}')
-
-    r, turn = np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64)
-    chi2, converged, r, turn, residual, white, information = descend_body(
-        r, turn, coils.offsets, coils.axes, coils.lengths, flux, inverse_sigma, common,
-        field.columns, field.moments, low, high, MAX_EVALUATIONS,
-    )  # fmt: skip
-    known = weigh(white, common, information, count)
-    return BodySolution(r, turn, chi2, information, residual, converged, white, *known)
+    start = np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64)
+    is_finite, solution = solve_near(*start, coils.arrays, flux, model)
+    if not is_finite:
+        raise TrackingError(NOT_FINITE)
+    return BodySolution(*solution)
 
 
 def start_from_coils(

@@ -16,10 +16,10 @@ from anser_ros.arrays import Array
 from anser_ros.kernel_cache import inlined
 from anser_ros.tracking.estimate import (
     USUAL_GATE,
-    NoiseScale,
     PoseEstimate,
     TrackerSettings,
     no_pose,
+    scale_of_frame,
 )
 from anser_ros.tracking.rigid import BodySolution
 from anser_ros.tracking.solve import CoilSolution, chi2_limit
@@ -98,7 +98,7 @@ class SolveFrame:
 
     def estimate(
         self,
-        noise: NoiseScale,
+        noise: Array,
         solution: CoilSolution | BodySolution,
         freedom: Freedom,
         pose: tuple[Array, Array, Array | None],
@@ -111,14 +111,15 @@ class SolveFrame:
     ) -> PoseEstimate:
         """Judge a solution by itself: its covariance, its state, and the reason for it.
 
-        ``pose`` are position, axis, and rotation or None, as the estimate has them. ``covariance``
-        returns the pose's (6, 6) before the scale, which it is given; ``what`` is uncertain where
-        that is too large. ``place`` (3,) has to be in the volume: the coil, or the middle of the
-        body's coils, m, frame fg. ``rivals`` are other poses, the likeliest first: the chi-square
-        of each, and its name in the reason; they are looked at only where the pose is good by
-        itself. ``in_metal``: whether the pose lies among the dipoles that stand for metal, where
-        the model's field is none; ``continues``: whether it goes on from a good one, which is the
-        only check of a pose without readings to spare.
+        ``noise`` (4,) is the state of its scale. ``pose`` are position, axis, and rotation or
+        None, as the estimate has them. ``covariance`` returns the pose's (6, 6) before the scale,
+        which it is given; ``what`` is uncertain where that is too large. ``place`` (3,) has to be
+        in the volume: the coil, or the middle of the body's coils, m, frame fg. ``rivals`` are
+        other poses, the likeliest first: the chi-square of each, and its name in the reason; they
+        are looked at only where the pose is good by itself. ``in_metal``: whether the pose lies
+        among the dipoles that stand for metal, where the model's field is none; ``continues``:
+        whether it goes on from a good one, which is the only check of a pose without readings to
+        spare.
         """
         settings, ratio = self.settings, solution.chi2 / freedom.of_residual
         scale = self._variance_scale(noise, ratio, freedom)
@@ -156,12 +157,13 @@ class SolveFrame:
             self.context.model_id, reason, freedom.checks,
         )  # fmt: skip
 
-    def _variance_scale(self, noise: NoiseScale, ratio: float, freedom: Freedom) -> float:
+    def _variance_scale(self, noise: Array, ratio: float, freedom: Freedom) -> float:
         """Return the factor on the variances of a pose; 1 where the noise is not adapted."""
         if not self.settings.adaptive:
             return 1.0
         usual, most = usual_and_most(self.settings, freedom)
         share, follows = self.context.model_share, self.context.modes is not None
         of_unknown = freedom.of_residual / freedom.unknowns
-        scale = noise.of_frame(ratio, usual, of_unknown, share, follows)
+        state = noise.tolist()
+        scale: float = scale_of_frame.py_func(state, ratio, usual, of_unknown, share, follows)
         return scale if ratio <= most else SYSTEMATIC * scale

@@ -22,6 +22,7 @@ from anser_ros.stamps import NANO
 from anser_ros.tracking import body_track, coil_step
 from anser_ros.tracking.body_track import BodyFit, BodyFrame
 from anser_ros.tracking.estimate import USUAL_GATE
+from anser_ros.tracking.rigid import fill_common
 from anser_ros.tracking.solve import RealField
 from anser_ros.tracking.solve_context import AS_THEY_ARE
 
@@ -72,15 +73,21 @@ def go_on(mean, covariance, seconds, rate, keep):  # type: ignore[no-untyped-def
 
 @kernel
 def learn_strengths(  # type: ignore[no-untyped-def]
-    rows, flux, inverse_sigma, common, away, count, most, mean, covariance
+    start, coils, rows, flux, model, away, count, most, mean, covariance
 ):  # fmt: skip
     """Return the power per freedom that strengths leave of a frame, learnt from if at ``most``.
 
-    The first seven ``rows`` are those of `BodySolution`, ``common`` is without strengths; the
-    ``flux`` (S, 2K), T, is corrected, by ``away`` (2K,) less than the ``mean``. ``count`` are the
-    readings less the pose's unknowns. ``mean`` and ``covariance`` are as of `go_on`.
+    The first seven ``rows`` are those of `BodySolution` at the pose ``start``; ``coils`` and
+    ``model`` are as of `solve_near`, which knows no errors of strengths here. The ``flux``
+    (S, 2K), T, is corrected, by ``away`` (2K,) less than the ``mean``. ``count`` are the readings
+    less the pose's unknowns. ``mean`` and ``covariance`` are as of `go_on`.
     """
-    width, size = flux.shape[1], flux.size
+    width, size, sigma = flux.shape[1], flux.size, model.sigma
+    common = np.empty((model.modes.shape[1] // width + coils[3].shape[0], size))
+    fill_common(
+        start[0], start[1], coils[0], coils[1], coils[2], coils[3], flux, model.uncertain,
+        model.modes, sigma, np.empty((0, 0)), common,
+    )  # fmt: skip
     white = np.zeros((7 + width, size))
     for i in range(7):
         for k in range(size):
@@ -88,7 +95,7 @@ def learn_strengths(  # type: ignore[no-untyped-def]
     for s in range(flux.shape[0]):
         for k in range(0, width, 2):
             for i in range(2):
-                w, column = inverse_sigma[k + i], s * width + k + i
+                w, column = 1.0 / sigma[k + i], s * width + k + i
                 white[7 + k, column] = w * flux[s, k + i]
                 white[8 + k, column] = w * flux[s, k + 1 - i] * (2 * i - 1)
     others = np.dot(white, common.T)
@@ -134,7 +141,6 @@ class EmitterStrengths:
         self._width = 0 if field is None else field.moments.shape[1]
         self._agreed = 0  # Frames in a row that were explained; negative where they were not
         self.used, self.errors = None, AS_THEY_ARE
-        self._open()
 
     def _open(self) -> None:
         """Forget what was learnt, but not what is used."""
@@ -162,6 +168,8 @@ class EmitterStrengths:
 
     def learn(self, stamp_ns: int, looks: Iterable[Look]) -> None:
         """Learn from a frame that was corrected by ``used``."""
+        if not self._last_ns:
+            self._open()
         seconds, self._last_ns = (stamp_ns - self._last_ns) * NANO, stamp_ns
         if not 0.0 <= seconds <= STREAM_GAP_S:
             self._agreed = 0
@@ -191,7 +199,7 @@ class EmitterStrengths:
         """
         solution, used = fit.solution, fit.used
         flux, start = frame.flux[used], (solution.position, solution.rotation)
-        common = frame.common(used, start, AS_THEY_ARE)
+        coils, model = frame.coils.subset(used).arrays, frame.context.arrays
         if not fit.good(USUAL_GATE):
             known = self._covariance[: self._width, : self._width]
             unknown = frame.context.with_strengths(np.linalg.cholesky(known))
@@ -202,7 +210,7 @@ class EmitterStrengths:
             away -= self.used.view(np.float64)
         unknowns = (body_track if len(used) > 1 else coil_step).UNKNOWNS
         ratio: float = learn_strengths(
-            solution.rows, flux, frame.inverse_sigma, common, away,
-            flux.size - unknowns, MOST_LEFT, self._mean, self._covariance,
+            start, coils, solution.rows, flux, model, away, flux.size - unknowns, MOST_LEFT,
+            self._mean, self._covariance,
         )  # fmt: skip
         return ratio <= MOST_LEFT

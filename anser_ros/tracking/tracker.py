@@ -43,7 +43,6 @@ from anser_ros.tracking.solve_context import (
     depends_on,
     without_dead,
 )
-from anser_ros.tracking.solve_verdict import SOUND
 from anser_ros.tracking.strengths import EmitterStrengths, Look
 
 
@@ -323,12 +322,12 @@ class Tracker:
         """Return the poses of fluxes (S, K) whose readings are good or bad by ``codes`` (S,)."""
         values = flux.view(np.float64)
         coils, ended = self._solved_coils(stamp_ns, values, codes, context)
-        frames, bodies = [], []
+        frames, bodies, rules = [], [], self._past.coils.rules
         for name, (rows, table) in self._scene.bodies.items():
             single = [coils[i] for i in rows]
             own = ended.position[rows], ended.axis[rows], ended.normal[rows]
             frame = BodyFrame(
-                name, stamp_ns, values[rows], context, self.settings, table, single, own
+                name, stamp_ns, values[rows], context, self.settings, table, single, own, rules
             )
             frames.append(frame)
             if context.symmetry is not None:
@@ -373,7 +372,7 @@ class Tracker:
                 own = found.position[None], found.axis[None], found.normal[None]
                 frame = BodyFrame(
                     estimate.name, stamp_ns, values[row : row + 1], context, self.settings, one,
-                    [], own,
+                    [], own, self._past.coils.rules,
                 )  # fmt: skip
                 turn = rotation_of_quaternion(np.array(quaternion_of_axis(found.axis)))
                 yield frame, solve_with(frame, np.zeros(1, np.int64), (found.position, turn))
@@ -383,16 +382,19 @@ class Tracker:
     ) -> tuple[list[CoilResult], Followed]:
         """Return what is found of each coil, and where the solves of all ended."""
         table, past, settings, results = self._scene.table, self._past, self.settings, []
-        tracks, lengths = past.coils, table.length.tolist()
-        ended = tracks.follow(stamp_ns, values, codes == GOOD, table.length, context, settings)
-        freedom, said = tracks.freedom, ended.fault.tolist()
-        for i, (name, code) in enumerate(zip(table.name, codes.tolist(), strict=True)):
-            if said[i] == SOUND:
-                results.append(tracks.followed(i, name, stamp_ns, ended, context.model_id))
+        tracks, lengths = past.coils, table.length
+        ended = tracks.follow(stamp_ns, values, codes == GOOD, lengths, context, settings)
+        followed = tracks.followed(stamp_ns, table.name, ended, context.model_id)
+        for i, (name, code, known) in enumerate(
+            zip(table.name, codes.tolist(), followed, strict=True)
+        ):
+            if known is not None:
+                results.append(known)
                 continue
             frame = CoilFrame(
-                name, stamp_ns, values[i], context, settings, lengths[i], i, tracks, freedom
-            )
+                name, stamp_ns, values[i], context, settings, float(lengths[i]), i, tracks,
+                tracks.freedom,
+            )  # fmt: skip
             fault = FAULTS[code]
             if fault is None:
                 result = track_coil(frame, ended)
@@ -463,19 +465,14 @@ def warm_up_bodies(model: FieldModel) -> None:
     context = build_context(model, TrackerSettings())
     coils = rigid.BodyCoils(np.zeros((3, 3)), np.eye(3), np.zeros(3))
     flux = model.flux(coils.offsets + [0.0, 0.0, 0.15], coils.axes, coils.lengths).view(np.float64)
-    weights = 1.0 / context.sigma
-    common = rigid.common_factor(np.zeros((3, 0, weights.size)), weights)
     normals, took_part = np.tile(np.eye(6), (3, 1, 1)), np.ones(3, dtype=bool)
     for start in rigid.start_from_grid(context.grid, context.field, coils, flux):
-        found = rigid.solve_body(
-            context.field, coils, flux, weights, common, *start, context.low, context.high
-        )
+        found = rigid.solve_body(coils, flux, context.arrays, *start)
         body = found.position, found.rotation
         own = coils.offsets + found.position, coils.axes @ found.rotation.T
         rigid.step_to_coils(
             *body, coils.offsets, coils.axes, *own, normals, context.low, context.high
         )
         distances(
-            (*body, np.eye(6)), coils.offsets, coils.axes, (*own, normals), took_part,
-            TrackerSettings().tools,
+            *body, np.eye(6), coils.offsets, coils.axes, *own, normals, took_part, np.zeros(3)
         )  # fmt: skip

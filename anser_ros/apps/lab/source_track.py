@@ -8,7 +8,7 @@ magnet in front of an array of magnetometers is tracked in this way.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -20,12 +20,14 @@ from anser_ros.physics.rotations import nearest_rotation, rotation_of_vector
 from anser_ros.refit.prior import vector_basis
 from anser_ros.sessions.prepared import PreparedSession, with_truth
 from anser_ros.sessions.tracked_session import PoseSeries, pose_series
-from anser_ros.tracking.body_track import BodyFrame, Start, Track
+from anser_ros.stamps import NANO
+from anser_ros.tracking.body_track import BodyFrame, Start
 from anser_ros.tracking.coil_step import UNKNOWNS
-from anser_ros.tracking.estimate import NoiseScale, PoseEstimate
-from anser_ros.tracking.rigid import BodyCoils, BodySolution, common_factor, solve_body
+from anser_ros.tracking.estimate import FRESH_NOISE, PoseEstimate, add_frame
+from anser_ros.tracking.rigid import BodyCoils, BodySolution, solve_body
 from anser_ros.tracking.seed import SAME_PLACE_M
-from anser_ros.tracking.solve import ROLL_VARIANCE, RealField, bounded_inverse
+from anser_ros.tracking.solve import ROLL_VARIANCE, bounded_inverse
+from anser_ros.tracking.solve_context import ModelArrays
 from anser_ros.tracking.solve_verdict import RARE, Freedom, SolveFrame
 
 DIRECTIONS, RATIO = 400, 1.15
@@ -84,9 +86,12 @@ def _directions() -> Array:
 
 
 @dataclass
-class SourceTrack(Track):
-    """Remembers one body: its scan, the last good pose, the noise scale."""
+class SourceTrack:
+    """Remembers one body: its scan, the last good pose and when it was, the noise scale."""
 
+    good: BodySolution | None = None
+    good_ns: int = 0
+    noise: Array = field(default_factory=lambda: np.array(FRESH_NOISE))
     scan: SourceScan | None = None
     coils: BodyCoils | None = None
 
@@ -107,7 +112,7 @@ class Sources:
     def forget(self) -> None:
         """Drop the last poses, so that the next solves start cold."""
         for track in self._tracks.values():
-            track.forget()
+            track.good = None
 
     def observe(self, bodies: Sequence[BodyFrame]) -> None:
         """Find the source in the frame of each body, if the field is that of one."""
@@ -150,22 +155,18 @@ class _SourceFrame(SolveFrame):
         return np.asarray((self.flux != 0.0).any(axis=0))
 
     @cached_property
-    def field(self) -> RealField:
-        """Return the field of the live components only."""
-        whole = self.context.field
-        return RealField(
-            whole.positions, whole.directions, np.ascontiguousarray(whole.moments[:, self.live])
-        )
+    def model(self) -> ModelArrays:
+        """Return the model of the live components only, without its uncertainty."""
+        whole, none = self.context.arrays, np.empty((0, 0))
+        return whole._replace(
+            moments=np.ascontiguousarray(whole.moments[:, self.live]),
+            sigma=whole.sigma[self.live], uncertain=np.empty((6, 0)), modes=none, strengths=none,
+        )  # fmt: skip
 
     def solved(self, start: Start) -> BodySolution:
         """Descend to the pose near a start."""
-        part, context, used = self.coils.subset(self.used), self.context, self.used
-        flux = np.ascontiguousarray(self.flux[np.ix_(used, self.live)])
-        weights = 1.0 / context.sigma[self.live]
-        gains = part.gain_changes.T[:, :, None] * flux[:, None, :]
-        common = common_factor(np.ascontiguousarray(gains), weights)
-        low, high = context.low - part.reach, context.high + part.reach
-        return solve_body(self.field, part, flux, weights, common, *start, low, high)
+        flux = np.ascontiguousarray(self.flux[np.ix_(self.used, self.live)])
+        return solve_body(self.coils.subset(self.used), flux, self.model, *start)
 
     def starts(self, scan: SourceScan) -> list[Start]:
         """Return poses of the body for the scan's best places."""
@@ -206,9 +207,9 @@ def track_source(track: SourceTrack, frame: _SourceFrame) -> PoseEstimate:
     if track.scan is None or track.coils is not frame.coils:
         near, far = _distances(frame)
         track.scan, track.coils = SourceScan(frame.coils, near, far), frame.coils
-        track.noise = NoiseScale()
-    good, found = track.fresh(frame.stamp_ns, settings), []
-    if good is not None:
+        track.noise = np.array(FRESH_NOISE)
+    good, found = track.good, []
+    if good is not None and (frame.stamp_ns - track.good_ns) * NANO <= settings.warm_age_s:
         found = [frame.solved(frame.rolled(good.position, good.rotation))]
     freedom = len(used) * int(frame.live.sum()) - UNKNOWNS
     if not found or not found[0].chi2 <= settings.gate**2 * freedom:
@@ -216,7 +217,7 @@ def track_source(track: SourceTrack, frame: _SourceFrame) -> PoseEstimate:
         found.sort(key=lambda solution: solution.chi2)
     estimate = _judged(track, frame, found, freedom)
     if estimate.state == states.OK:
-        track.remember(found[0], frame.stamp_ns)
+        track.good, track.good_ns = found[0], frame.stamp_ns
     return estimate
 
 
@@ -274,5 +275,5 @@ def _judged(
         solution.position + solution.rotation @ frame.coils.offsets.mean(axis=0), 'place',
     )  # fmt: skip
     if estimate.state == states.OK:
-        track.noise.add(estimate.chi2)
+        add_frame.py_func(track.noise, estimate.chi2, 0.0)
     return estimate
