@@ -18,6 +18,7 @@ from anser_ros.tracking.estimate import (
     TrackerSettings,
     add_frame,
     scale_of_frame,
+    sigma_factor,
 )
 from anser_ros.tracking.tracker import Tracker
 
@@ -208,7 +209,7 @@ def test_sensors_and_settings_that_are_none_are_refused():
 def test_no_gate_is_the_same_however_it_is_said(gate):
     """The node's largest gate refuses no more than the infinite one of a command line does."""
     settings = TrackerSettings(gate=gate)
-    assert not settings.has_gate and settings.max_sigma_factor(9.0) == 3.0
+    assert not settings.has_gate and sigma_factor.py_func(settings.has_gate, 9.0) == 3.0
     assert settings.margin(400.0) == -math.inf, 'the best of poses that all fit badly is taken'
     assert TrackerSettings(gate=NO_GATE / 2).margin(400.0) > 0.0
 
@@ -249,7 +250,7 @@ def test_a_misfit_that_lasts_from_frame_to_frame_is_no_noise(rng):
             add_frame.py_func(scale, ratio, product)
         last = white
     noisy, wrong, among_metal = (partial(scale_of_frame.py_func, scale) for scale in scales)
-    usual = 17.3 / 11.0
+    usual = 17.3 / 11.0, np.inf
     assert noisy(4.0, usual, 2.2, 0.0, False) == pytest.approx(4.0, rel=0.01)
     for ratio in (1.0, 4.0):  # what the frames before had, this one has too
         assert wrong(ratio, usual, 2.2, 0.0, False) > 10.0

@@ -15,7 +15,7 @@ from anser_ros.tracking.coil_step import MOST_STEPS, SUSPICIOUS_JUMP_M, distance
 from anser_ros.tracking.estimate import FRESH_NOISE, add_frame, scale_of_frame, sigma_factor
 from anser_ros.tracking.rigid import carried_on, reach_of, solve_near, step_to_coils
 from anser_ros.tracking.seed import SAME_PLACE_M
-from anser_ros.tracking.solve_verdict import SOUND, SYSTEMATIC, fault_of
+from anser_ros.tracking.solve_verdict import SOUND, fault_of
 
 UNKNOWNS = 6
 """Numbers that a body's pose has."""
@@ -108,11 +108,8 @@ def follow_body(  # type: ignore[no-untyped-def]
     freedom = max(size - UNKNOWNS, 1)
     ratio = found.chi2 / freedom
     if rules.adaptive:
-        follows = model.modes.shape[0] > 0
-        scale = scale_of_frame(
-            memory.noise, ratio, limits[0], freedom / UNKNOWNS, model.share, follows
-        )  # fmt: skip
-        scale *= SYSTEMATIC if ratio > limits[1] else 1.0
+        share, follows = freedom / UNKNOWNS, model.modes.shape[0] > 0
+        scale = scale_of_frame(memory.noise, ratio, limits, share, model.share, follows)
     for i in range(6):
         for j in range(6):
             by_gain = found.gain * found.carried[i] * (found.gain * found.carried[j])

@@ -14,10 +14,10 @@ from anser_ros.tracking import body_step, rigid
 from anser_ros.tracking.body_step import UNKNOWNS
 from anser_ros.tracking.coil_step import Rules
 from anser_ros.tracking.coil_track import CoilResult
-from anser_ros.tracking.estimate import PoseEstimate
+from anser_ros.tracking.estimate import SYSTEMATIC, PoseEstimate
 from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve_context import NOT_FINITE
-from anser_ros.tracking.solve_verdict import RARE, SYSTEMATIC, Freedom, SolveFrame, usual_and_most
+from anser_ros.tracking.solve_verdict import RARE, Freedom, SolveFrame, usual_and_most
 
 DISAGREES = 4.0
 """A coil is left out when its share of the misfit is so many times the mean of the others'."""

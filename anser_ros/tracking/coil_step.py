@@ -17,14 +17,7 @@ from anser_ros.tracking.descent import descend
 from anser_ros.tracking.estimate import TrackerSettings, add_frame, scale_of_frame, sigma_factor
 from anser_ros.tracking.solve import MAX_EVALUATIONS, CoilSolution, coil_covariance
 from anser_ros.tracking.solve_context import fill_model_errors
-from anser_ros.tracking.solve_verdict import (
-    IN_METAL,
-    SOUND,
-    SYSTEMATIC,
-    Freedom,
-    fault_of,
-    usual_and_most,
-)
+from anser_ros.tracking.solve_verdict import IN_METAL, SOUND, Freedom, fault_of, usual_and_most
 
 SUSPICIOUS_JUMP_M = 0.02
 """A pose that moved further from one frame to the next, m, is confirmed by a scan, for it may be
@@ -230,10 +223,8 @@ def _judge_coil(s, memory, model, rules, out):  # type: ignore[no-untyped-def]
     ratio, scale, power, position = out.found[s, 0] / rules.freedom, 1.0, 0.0, out.position[s]
     if rules.adaptive:
         share, follows = rules.freedom / UNKNOWNS, model.modes.shape[0] > 0
-        scale = scale_of_frame(
-            memory.noise[s], ratio, rules.usual, share, model.share, follows
-        )  # fmt: skip
-        scale *= SYSTEMATIC if ratio > rules.most else 1.0
+        limits = rules.usual, rules.most
+        scale = scale_of_frame(memory.noise[s], ratio, limits, share, model.share, follows)
     covariance = coil_covariance(out.normal[s], out.axis[s], rules.roll_variance / scale)
     for i in range(6):
         for j in range(6):

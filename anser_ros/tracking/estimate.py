@@ -38,9 +38,17 @@ SUDDEN_FRAMES, SUDDEN = 8.0, 0.5
 alone it has 0 +- 0.08. The long mean alone lets a bend of 0.8 mm pass for noise for a second."""
 
 
+SYSTEMATIC = 25.0
+"""Factor on the variances of a pose whose misfit is more than noise where no gate refuses it, of
+one that only a gate wider than the usual one lets pass, and of one without a check. A wrong gain
+moves a pose further than noise of the same residual: by up to 8 of its sigmas with a factor of 4
+(2 to 20 %, on one coil, simulated). Smaller, and 3 sigma do not hold there; larger, and poses that
+are asked for in spite of their misfit are called more uncertain than they are."""
+
+
 @inlined
 def sigma_factor(has_gate, scale):  # type: ignore[no-untyped-def]
-    """Return the factor on the largest sigma, see `TrackerSettings.max_sigma_factor`."""
+    """Return the factor on ``max_sigma_m``: larger without a gate, by the misfit."""
     return 1.0 if has_gate else math.sqrt(max(1.0, scale))
 
 
@@ -115,10 +123,6 @@ class TrackerSettings:
             return -math.inf
         return 2.0 * math.log(self.odds) * max(1.0, ratio)
 
-    def max_sigma_factor(self, scale: float) -> float:
-        """Return the factor on ``max_sigma_m``: larger without a gate, by the misfit."""
-        return float(sigma_factor.py_func(self.has_gate, scale))
-
 
 @dataclass  # Not frozen: it would take three times as long to make, ten times a frame
 class PoseEstimate:
@@ -147,10 +151,6 @@ class PoseEstimate:
         matrix = self.covariance
         return math.sqrt(matrix[0, 0] + matrix[1, 1] + matrix[2, 2])
 
-    def add_shift(self, covariance: Array) -> None:
-        """Add a shared error's covariance (6, 6) to the estimate's, which is no other's."""
-        self.covariance[:] += covariance
-
 
 def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) -> PoseEstimate:
     """Return an estimate without a pose: all figures NaN."""
@@ -171,16 +171,16 @@ been as expected. Noise is new in each frame; what stays in the residuals is mis
 
 
 @inlined
-def scale_of_frame(noise, ratio, usual, share, model_share, follows):  # type: ignore[no-untyped-def]
+def scale_of_frame(noise, ratio, limits, share, model_share, follows):  # type: ignore[no-untyped-def]
     """Return one frame's variance scale: the running one, or more if its residual asks for it.
 
-    ``ratio`` is its residual power over the expected one, and ``usual`` what noise seldom
-    exceeds; more comes from a bent field. ``share`` are degrees of freedom for each dimension of
-    the pose: what stays in the former of a bent field shows, as a power, what goes into the
-    latter. ``model_share`` of the expected residual is the model's own error. It bends the field
-    as metal does, and as much of it goes into the pose, however many readings there are. If the
-    model states its error by modes, which it ``follows``, no small residual takes that error off
-    the pose, and no lasting misfit is taken for noise.
+    ``ratio`` is its residual power over the expected one, and ``limits`` what noise seldom
+    exceeds, of which more comes from a bent field, and what is `SYSTEMATIC`. ``share`` are
+    degrees of freedom for each dimension of the pose: what stays in the former of a bent field
+    shows, as a power, what goes into the latter. ``model_share`` of the expected residual is the
+    model's own error. It bends the field as metal does, and as much of it goes into the pose,
+    however many readings there are. If the model states its error by modes, which it ``follows``,
+    no small residual takes that error off the pose, and no lasting misfit is taken for noise.
     """
     hidden, lasting = HIDDEN * share, noise[2] / noise[0]
     misfit = max(lasting - model_share - SLIGHT, 0.0)  # beyond the model's own error
@@ -189,7 +189,8 @@ def scale_of_frame(noise, ratio, usual, share, model_share, follows):  # type: i
     scale *= 1.0 + model_share * max(hidden - 1.0, 0.0)
     expected = min(least, 1.0) if follows else least
     sudden = noise[3] - model_share - SUDDEN
-    return scale + hidden * max(misfit, sudden, ratio - usual * expected)
+    scale += hidden * max(misfit, sudden, ratio - limits[0] * expected)
+    return scale if ratio <= limits[1] else SYSTEMATIC * scale
 
 
 @inlined

@@ -18,7 +18,7 @@ from anser_ros.integrity import pose_checks
 from anser_ros.integrity.pose_checks import ARM_M, STREAM_GAP_S, Continuity, Place
 from anser_ros.stamps import NANO
 from anser_ros.tracking.body_track import BodyResult
-from anser_ros.tracking.coil_step import UNKNOWNS
+from anser_ros.tracking.coil_step import UNKNOWNS, Followed
 from anser_ros.tracking.coil_track import CoilResult
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
 from anser_ros.tracking.rigid import BodyCoils
@@ -97,11 +97,15 @@ class ModelRecord:
 
 @dataclass(frozen=True)
 class RigidBody:
-    """Holds a body's coils: their rows among the sensors, their places, and what was found."""
+    """Holds a body's coils: their rows among the sensors, their places, and what was found.
+
+    ``ended`` is what was found of all sensors, with their covariances.
+    """
 
     rows: Integers
     coils: BodyCoils
     result: BodyResult
+    ended: Followed
 
 
 class Judgement:
@@ -182,7 +186,7 @@ class Judgement:
             why = f"the body's coils fit no pose together: {estimate.reason}"
             against = dict.fromkeys(members, why)
         elif estimate.state in (states.OK, states.OUTSIDE_VOLUME):
-            against = _contradictions(found, body, sorted(members), settings)
+            against = _contradictions(body, sorted(members), settings)
             agree = members & set(fit.used.tolist()) - {*against}
             apart = members - agree
             if against and pose_checks.is_part(body.coils.offsets, apart, agree):
@@ -296,17 +300,17 @@ def _take_strangers(
 
 
 def _contradictions(
-    found: Estimates, body: RigidBody, members: list[int], settings: TrackerSettings
+    body: RigidBody, members: list[int], settings: TrackerSettings
 ) -> dict[int, str]:
     """Return why some coils of a body, ``members`` by their numbers in it, contradict its pose."""
     estimate, fit, tools = body.result.estimate, body.result.fit, settings.tools
     assert fit is not None
-    own = [found[row] for row in body.rows[members].tolist()]
+    rows, ended = body.rows[members], body.ended
     coils, used = body.coils.subset(np.array(members)), set(fit.used.tolist())
     away = pose_checks.distances(
         estimate.position, fit.solution.rotation, estimate.covariance, coils.offsets, coils.axes,
-        np.array([e.position for e in own]), np.array([e.axis for e in own]),
-        np.array([e.covariance for e in own]), np.array([i in used for i in members]),
+        ended.position[rows], ended.axis[rows], ended.covariance[rows],
+        np.array([i in used for i in members]),
         np.array([tools.tool_coil_position_m, tools.tool_coil_axis_rad, tools.tool_coil_gain]),
     )  # fmt: skip
     return {

@@ -20,6 +20,7 @@ from anser_ros.tracking.estimate import (
     TrackerSettings,
     no_pose,
     scale_of_frame,
+    sigma_factor,
 )
 from anser_ros.tracking.rigid import BodySolution
 from anser_ros.tracking.solve import CoilSolution, chi2_limit
@@ -29,13 +30,6 @@ RARE = 0.01
 """Probability of the residual of many sensors together beyond which it counts as more than noise.
 It is smaller than that of a single coil, for many degrees of freedom make much of a small
 excess."""
-
-SYSTEMATIC = 25.0
-"""Factor on the variances of a pose whose misfit is more than noise where no gate refuses it, of
-one that only a gate wider than the usual one lets pass, and of one without a check. A wrong gain
-moves a pose further than noise of the same residual: by up to 8 of its sigmas with a factor of 4
-(2 to 20 %, on one coil, simulated). Smaller, and 3 sigma do not hold there; larger, and poses that
-are asked for in spite of their misfit are called more uncertain than they are."""
 
 
 SOUND, MISFIT, OUTSIDE, UNENDED, UNCERTAIN, IN_METAL = range(6)
@@ -122,14 +116,20 @@ class SolveFrame:
         spare.
         """
         settings, ratio = self.settings, solution.chi2 / freedom.of_residual
-        scale = self._variance_scale(noise, ratio, freedom)
+        scale, limits = 1.0, usual_and_most(settings, freedom)
+        if settings.adaptive:
+            share, follows = self.context.model_share, self.context.modes is not None
+            of_unknown = freedom.of_residual / freedom.unknowns
+            scale = scale_of_frame.py_func(
+                noise.tolist(), ratio, limits, of_unknown, share, follows
+            )
         scaled = scale * covariance(scale)
         sigma_m = math.sqrt(scaled[0, 0] + scaled[1, 1] + scaled[2, 2])
         flat = solution.residual.ravel()
         residual_t = math.sqrt(float(flat @ flat) / flat.size)
         fault = fault_of.py_func(
             ratio, settings.gate, settings.box.contains(place), solution.converged, sigma_m,
-            settings.max_sigma_m * settings.max_sigma_factor(scale),
+            settings.max_sigma_m * sigma_factor.py_func(settings.has_gate, scale),
             in_metal and settings.has_gate,
         )  # fmt: skip
         state, reason = states.AMBIGUOUS, ''
@@ -156,14 +156,3 @@ class SolveFrame:
             self.name, self.stamp_ns, state, *pose, scaled, residual_t, ratio,
             self.context.model_id, reason, freedom.checks,
         )  # fmt: skip
-
-    def _variance_scale(self, noise: Array, ratio: float, freedom: Freedom) -> float:
-        """Return the factor on the variances of a pose; 1 where the noise is not adapted."""
-        if not self.settings.adaptive:
-            return 1.0
-        usual, most = usual_and_most(self.settings, freedom)
-        share, follows = self.context.model_share, self.context.modes is not None
-        of_unknown = freedom.of_residual / freedom.unknowns
-        state = noise.tolist()
-        scale: float = scale_of_frame.py_func(state, ratio, usual, of_unknown, share, follows)
-        return scale if ratio <= most else SYSTEMATIC * scale

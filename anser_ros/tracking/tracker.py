@@ -30,8 +30,9 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import Withheld
 from anser_ros.stamps import NANO
 from anser_ros.tracking import rigid
+from anser_ros.tracking.body_step import BodyMemory, follow_body
 from anser_ros.tracking.body_track import BodyFrame, BodyResult, BodyTrack, solve_with, track_body
-from anser_ros.tracking.coil_step import Followed
+from anser_ros.tracking.coil_step import Followed, freedom_of, rules_of
 from anser_ros.tracking.coil_track import CoilFrame, CoilResult, CoilTracks, track_coil
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.judgement import Judgement, RigidBody
@@ -335,7 +336,7 @@ class Tracker:
                 result = BodyResult(frame.no_pose(states.AMBIGUOUS, reason))
             else:
                 result = track_body(self._past.bodies[name], frame)
-            bodies.append(RigidBody(rows, table, result))
+            bodies.append(RigidBody(rows, table, result, ended))
         for observer in self._past.observers:
             observer.observe(frames)
         if learns:
@@ -353,7 +354,7 @@ class Tracker:
             turns = dict(zip(names, (one.rotation for one in judged), strict=True))
             shifts = {name: shift(name, turn) for name, turn in turns.items()}
             for name, one in zip(names, judged, strict=True):
-                one.add_shift(shifts[name])
+                one.covariance += shifts[name]
         return judged
 
     def _looks(
@@ -405,6 +406,8 @@ class Tracker:
                 result = CoilResult(frame.no_pose(fault.state, reason), None)
             if (one := result.solution) is not None:
                 ended.position[i], ended.axis[i], ended.normal[i] = one[0], one[1], one.normal
+                ended.covariance[i] = result.estimate.covariance
+                result.estimate.covariance = ended.covariance[i]
             results.append(result)
         return results, ended
 
@@ -462,17 +465,20 @@ def warm_up() -> None:
 
 def warm_up_bodies(model: FieldModel) -> None:
     """Solve a small made-up body alone, which `warm_up` comes to last."""
-    context = build_context(model, TrackerSettings())
+    settings = TrackerSettings()
+    context = build_context(model, settings)
     coils = rigid.BodyCoils(np.zeros((3, 3)), np.eye(3), np.zeros(3))
-    flux = model.flux(coils.offsets + [0.0, 0.0, 0.15], coils.axes, coils.lengths).view(np.float64)
-    normals, took_part = np.tile(np.eye(6), (3, 1, 1)), np.ones(3, dtype=bool)
-    for start in rigid.start_from_grid(context.grid, context.field, coils, flux):
-        found = rigid.solve_body(coils, flux, context.arrays, *start)
-        body = found.position, found.rotation
-        own = coils.offsets + found.position, coils.axes @ found.rotation.T
-        rigid.step_to_coils(
-            *body, coils.offsets, coils.axes, *own, normals, context.low, context.high
-        )
-        distances(
-            *body, np.eye(6), coils.offsets, coils.axes, *own, normals, took_part, np.zeros(3)
-        )  # fmt: skip
+    memory, every = BodyMemory.empty(), np.arange(3)
+    memory.position[:], memory.rotation[:] = [0.0, 0.0, 0.15], np.eye(3)
+    places, normals = np.tile(memory.position[0], (3, 1)), np.tile(np.eye(6), (3, 1, 1))
+    flux = model.flux(places, coils.axes, coils.lengths).view(np.float64)
+    rules = rules_of(settings, freedom_of(flux.shape[1], context.readings))
+    rigid.start_from_grid(context.grid, context.field, coils, flux)
+    found = follow_body(
+        1, flux, coils.arrays, every, True, (places, coils.axes, normals), every, memory,
+        context.arrays, context.middle, rules, (1.0, 1.0),
+    )[-1]  # fmt: skip
+    distances(
+        found.position, found.rotation, np.eye(6), coils.offsets, coils.axes, places, coils.axes,
+        normals, np.ones(3, dtype=bool), np.zeros(3),
+    )  # fmt: skip
