@@ -265,11 +265,6 @@ class BodyCoils:
         )
 
     @cached_property
-    def reach(self) -> float:
-        """Return the largest distance of a coil from the tool's origin, m."""
-        return float(np.linalg.norm(self.offsets, axis=1).max())
-
-    @cached_property
     def middle(self) -> Array:
         """Return the mean of the offsets, (3,), m."""
         return np.asarray(self.offsets.mean(axis=0))
