@@ -1,6 +1,6 @@
 """Follows a rigid tool through time by all of its usable coils, without those that disagree."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -12,7 +12,7 @@ from anser_ros.integrity.pose_checks import is_part
 from anser_ros.stamps import NANO
 from anser_ros.tracking import body_step, rigid
 from anser_ros.tracking.body_step import UNKNOWNS
-from anser_ros.tracking.coil_step import Rules
+from anser_ros.tracking.coil_step import Followed, Rules
 from anser_ros.tracking.coil_track import CoilResult
 from anser_ros.tracking.estimate import SYSTEMATIC, PoseEstimate
 from anser_ros.tracking.seed import SAME_PLACE_M
@@ -80,30 +80,18 @@ class BodyFit:
         return self.solution.converged and self.ratio <= gate**2
 
 
-@dataclass(frozen=True)
-class BodyResult:
-    """Holds an estimate with the fit behind it; None where nothing was solved.
-
-    ``gain`` is what all coils' gain may be off by, see `BodySolution.gain`; 0 where that is known
-    of none.
-    """
-
-    estimate: PoseEstimate
-    fit: BodyFit | None = None
-    gain: float = 0.0
-
-
 @dataclass
 class BodyFrame(SolveFrame):
     """Holds a body's fluxes (S, 2K), its coils, and what each of these found by itself.
 
-    ``own`` are positions (S, 3), m, axes (S, 3) and normal matrices (S, 6, 6) of their solutions,
-    ``rules`` those that coils were judged by.
+    ``ended`` is what was found of all coils, of which the body's are ``rows`` (S,), and ``rules``
+    are those that they were judged by.
     """
 
     coils: rigid.BodyCoils
     single: list[CoilResult]
-    own: tuple[Array, Array, Array]
+    rows: Integers
+    ended: Followed
     rules: Rules
 
     @cached_property
@@ -124,6 +112,15 @@ class BodyFrame(SolveFrame):
             dtype=np.int64,
         )
         return good if self.coils.subset(good).observable else good[:0]
+
+
+@dataclass(frozen=True)
+class BodyResult:
+    """Holds a frame's estimate with the fit behind it; None where nothing was solved."""
+
+    frame: BodyFrame
+    estimate: PoseEstimate
+    fit: BodyFit | None = None
 
 
 def solve_with(frame: BodyFrame, used: Integers, start: Start) -> BodyFit:
@@ -182,10 +179,10 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
         reason = f'{count}; two that are not parallel are needed'
         bad = (c.estimate.state for c in frame.single if not c.usable)
         worst = next((state for state in bad if state != states.OK), states.AMBIGUOUS)
-        return BodyResult(frame.no_pose(worst, reason))
+        return BodyResult(frame, frame.no_pose(worst, reason))
     fit, estimate = _follow(track, frame)
     if fit is not None and estimate is not None:
-        return BodyResult(estimate, fit, fit.solution.gain)
+        return BodyResult(frame, estimate, fit)
     if fit is not None:
         fit = _without_disagreeing(fit, frame, gate)
     fits = [fit] if fit is not None and fit.good(gate) else []
@@ -196,11 +193,11 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
         fits[:1] = [_without_disagreeing(f, frame, gate) for f in fits[:1]]
     if not fits:
         reason = 'no coil of this body has a pose to start from'
-        return BodyResult(frame.no_pose(states.RESIDUAL, reason))
+        return BodyResult(frame, frame.no_pose(states.RESIDUAL, reason))
     fits += _on_other_sides(frame, fits[0])
     fits.sort(key=lambda candidate: candidate.ratio)
     fit = fits[0]
-    result, gain = _judge(track, frame, fit, fits[1:], continues)
+    result = _judge(track, frame, fit, fits[1:], continues)
     if result.state == states.OK:
         found = fit.solution
         body_step.remember(
@@ -208,7 +205,7 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
             fit.freedom, track.memory,
         )  # fmt: skip
         track.note(frame, fit)
-    return BodyResult(result, fit, gain)
+    return BodyResult(frame, result, fit)
 
 
 def _follow(track: BodyTrack, frame: BodyFrame) -> tuple[BodyFit | None, PoseEstimate | None]:
@@ -221,10 +218,12 @@ def _follow(track: BodyTrack, frame: BodyFrame) -> tuple[BodyFit | None, PoseEst
         kept = np.array([i for i in whole.tolist() if i not in track.left_out], dtype=np.int64)
         if len(kept) > 1 and coils.subset(kept).observable:
             tries.insert(0, kept)
+    ended, rows = frame.ended, frame.rows
+    own = ended.position[rows], ended.axis[rows], ended.normal[rows]
     for used in tries:
         freedom, is_whole = frame.freedom(used), len(used) == len(whole)
         is_finite, is_sound, covariance, residual_t, solution = body_step.follow_body(
-            stamp_ns, frame.flux, coils.arrays, used, is_whole, frame.own, frame.good,
+            stamp_ns, frame.flux, coils.arrays, used, is_whole, own, frame.good,
             track.memory, context.arrays, context.middle, frame.rules,
             usual_and_most(frame.settings, freedom),
         )  # fmt: skip
@@ -276,11 +275,10 @@ def _on_other_sides(frame: BodyFrame, fit: BodyFit) -> list[BodyFit]:
 
 def _judge(
     track: BodyTrack, frame: BodyFrame, fit: BodyFit, rivals: list[BodyFit], continues: bool
-) -> tuple[PoseEstimate, float]:
-    """The estimate, and by how much a common gain may be off, the error of which it has too."""
-    solution = fit.solution
-    covariance, gain = solution.covariance, solution.gain
-    by_gain = np.outer(gain * solution.carried, gain * solution.carried)
+) -> PoseEstimate:
+    """The estimate, which has the error of a gain that all coils have in common, too."""
+    solution, covariance = fit.solution, fit.solution.covariance
+    by_gain = np.outer(*[solution.gain * solution.carried] * 2)
     position, rotation = solution.position, solution.rotation
     others = (
         (rival.solution.chi2, 'another pose')
@@ -300,8 +298,8 @@ def _judge(
         continues=continues,
     )  # fmt: skip
     if estimate.state == states.OK:
-        estimate = replace(estimate, reason=_left_out(frame, fit))
-    return estimate, gain
+        estimate.reason = _left_out(frame, fit)
+    return estimate
 
 
 def _apart(one: rigid.BodySolution, other: rigid.BodySolution) -> bool:

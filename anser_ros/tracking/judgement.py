@@ -8,7 +8,7 @@ the last seconds' unexplained is doubtful, though single poses pass by chance.
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from anser_ros.integrity import pose_checks
 from anser_ros.integrity.pose_checks import ARM_M, STREAM_GAP_S, Continuity, Place
 from anser_ros.stamps import NANO
 from anser_ros.tracking.body_track import BodyResult
-from anser_ros.tracking.coil_step import UNKNOWNS, Followed
+from anser_ros.tracking.coil_step import UNKNOWNS
 from anser_ros.tracking.coil_track import CoilResult
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
 from anser_ros.tracking.rigid import BodyCoils
@@ -95,19 +95,6 @@ class ModelRecord:
         )
 
 
-@dataclass(frozen=True)
-class RigidBody:
-    """Holds a body's coils: their rows among the sensors, their places, and what was found.
-
-    ``ended`` is what was found of all sensors, with their covariances.
-    """
-
-    rows: Integers
-    coils: BodyCoils
-    result: BodyResult
-    ended: Followed
-
-
 class Judgement:
     """Holds what the checks remember of a tracker's sensors and bodies."""
 
@@ -128,7 +115,7 @@ class Judgement:
         self,
         stamp_ns: int,
         coils: Sequence[CoilResult],
-        bodies: Sequence[RigidBody],
+        bodies: Sequence[BodyResult],
         settings: TrackerSettings,
         loose: Sequence[tuple[Integers, BodyCoils]] = (),
     ) -> Estimates:
@@ -139,12 +126,12 @@ class Judgement:
         found = [result.estimate for result in coils]
         alone = set(range(len(coils)))
         for body in bodies:
-            if body.result.fit is not None:
-                alone.difference_update(body.rows.tolist())
-            if body.result.gain > 0.0:
-                _add_gain_error(found, coils, body.rows.tolist(), body.result.gain)
+            if body.fit is not None:
+                rows, gain = body.frame.rows.tolist(), body.fit.solution.gain
+                alone.difference_update(rows)
+                _add_gain_error(found, coils, rows if gain > 0.0 else (), gain)
         _add_gain_error(found, coils, alone, math.nan)
-        of_bodies = [body.result.estimate for body in bodies]
+        of_bodies = [body.estimate for body in bodies]
         if settings.judges:
             of_bodies = [self._judged_by_coils(found, body, settings) for body in bodies]
             for rows, table in loose:
@@ -155,7 +142,7 @@ class Judgement:
             found = [self._judged_in_time(estimate, settings) for estimate in found]
             single = set(range(len(coils)))
             for i, body in enumerate(bodies):
-                rows = body.rows.tolist()
+                rows = body.frame.rows.tolist()
                 self._take_alternating(found, [*rows, len(coils) + i])
                 single.difference_update(rows)
             groups = [rows.tolist() for rows, _ in loose]
@@ -168,7 +155,7 @@ class Judgement:
         return found
 
     def _judged_by_coils(
-        self, found: Estimates, body: RigidBody, settings: TrackerSettings
+        self, found: Estimates, body: BodyResult, settings: TrackerSettings
     ) -> PoseEstimate:
         """Return a body's estimate; withhold, in ``found``, the poses of coils that contradict it.
 
@@ -177,8 +164,9 @@ class Judgement:
         is where one part of the tool contradicts the other, see `pose_checks.is_part`, and stays
         until a frame in which coils of both agree: a bend lasts, also where one part is unseen.
         """
-        estimate, fit = body.result.estimate, body.result.fit
-        members = {i for i, row in enumerate(body.rows.tolist()) if found[row].state == states.OK}
+        estimate, fit = body.estimate, body.fit
+        rows = body.frame.rows.tolist()
+        members = {i for i, row in enumerate(rows) if found[row].state == states.OK}
         if fit is None or not members:
             return estimate
         against: dict[int, str] = {}
@@ -189,7 +177,7 @@ class Judgement:
             against = _contradictions(body, sorted(members), settings)
             agree = members & set(fit.used.tolist()) - {*against}
             apart = members - agree
-            if against and pose_checks.is_part(body.coils.offsets, apart, agree):
+            if against and pose_checks.is_part(body.frame.coils.offsets, apart, agree):
                 words = next(iter(against.values()))
                 why = f'{len(apart)} of {len(members)} coils contradict the others: {words}'
                 self._split[estimate.name] = apart, agree, why
@@ -200,8 +188,7 @@ class Judgement:
                 against = dict.fromkeys(members, why)
                 estimate = replace(estimate, state=states.INCONSISTENT, reason=why)
         for i, why in against.items():
-            row = int(body.rows[i])
-            found[row] = replace(found[row], state=states.INCONSISTENT, reason=why)
+            found[rows[i]] = replace(found[rows[i]], state=states.INCONSISTENT, reason=why)
         return estimate
 
     def _add_to_record(self, stamp_ns: int, coils: Estimates) -> None:
@@ -300,13 +287,13 @@ def _take_strangers(
 
 
 def _contradictions(
-    body: RigidBody, members: list[int], settings: TrackerSettings
+    body: BodyResult, members: list[int], settings: TrackerSettings
 ) -> dict[int, str]:
     """Return why some coils of a body, ``members`` by their numbers in it, contradict its pose."""
-    estimate, fit, tools = body.result.estimate, body.result.fit, settings.tools
+    estimate, fit, tools = body.estimate, body.fit, settings.tools
     assert fit is not None
-    rows, ended = body.rows[members], body.ended
-    coils, used = body.coils.subset(np.array(members)), set(fit.used.tolist())
+    rows, ended = body.frame.rows[members], body.frame.ended
+    coils, used = body.frame.coils.subset(np.array(members)), set(fit.used.tolist())
     away = pose_checks.distances(
         estimate.position, fit.solution.rotation, estimate.covariance, coils.offsets, coils.axes,
         ended.position[rows], ended.axis[rows], ended.covariance[rows],

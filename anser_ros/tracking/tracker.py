@@ -35,7 +35,7 @@ from anser_ros.tracking.body_track import BodyFrame, BodyResult, BodyTrack, solv
 from anser_ros.tracking.coil_step import Followed, freedom_of, rules_of
 from anser_ros.tracking.coil_track import CoilFrame, CoilResult, CoilTracks, track_coil
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
-from anser_ros.tracking.judgement import Judgement, RigidBody
+from anser_ros.tracking.judgement import Judgement
 from anser_ros.tracking.solve_context import (
     FEWEST_EMITTERS,
     ReducedScene,
@@ -323,27 +323,25 @@ class Tracker:
         """Return the poses of fluxes (S, K) whose readings are good or bad by ``codes`` (S,)."""
         values = flux.view(np.float64)
         coils, ended = self._solved_coils(stamp_ns, values, codes, context)
-        frames, bodies, rules = [], [], self._past.coils.rules
+        bodies = []
         for name, (rows, table) in self._scene.bodies.items():
-            single = [coils[i] for i in rows]
-            own = ended.position[rows], ended.axis[rows], ended.normal[rows]
             frame = BodyFrame(
-                name, stamp_ns, values[rows], context, self.settings, table, single, own, rules
-            )
-            frames.append(frame)
+                name, stamp_ns, values[rows], context, self.settings, table,
+                [coils[i] for i in rows.tolist()], rows, ended, self._past.coils.rules,
+            )  # fmt: skip
             if context.symmetry is not None:
                 reason = 'the field is the same all around its axis: a turn about it stays unknown'
-                result = BodyResult(frame.no_pose(states.AMBIGUOUS, reason))
+                result = BodyResult(frame, frame.no_pose(states.AMBIGUOUS, reason))
             else:
                 result = track_body(self._past.bodies[name], frame)
-            bodies.append(RigidBody(rows, table, result, ended))
+            bodies.append(result)
         for observer in self._past.observers:
-            observer.observe(frames)
+            observer.observe([body.frame for body in bodies])
         if learns:
-            looks = self._looks(frames, bodies, coils, values, context)
+            looks = self._looks(bodies, coils, ended, values, context)
             self._past.strengths.learn(stamp_ns, looks)
         loose = [*self._scene.parallel]
-        loose += [(body.rows, body.coils) for body in bodies if body.result.fit is None]
+        loose += [(one.frame.rows, one.frame.coils) for one in bodies if one.fit is None]
         if context.symmetry is not None:
             loose = []  # where coils are about the axis of the field is not known
         judged = self._past.judgement.judged(stamp_ns, coils, bodies, self.settings, loose)
@@ -358,22 +356,19 @@ class Tracker:
         return judged
 
     def _looks(
-        self, frames: Sequence[BodyFrame], bodies: Sequence[RigidBody],
-        coils: Sequence[CoilResult], values: Array, context: SolveContext,
+        self, bodies: Sequence[BodyResult], coils: Sequence[CoilResult], ended: Followed,
+        values: Array, context: SolveContext,
     ) -> Iterator[Look]:  # fmt: skip
         """What emitters' strengths can be learnt from: bodies, and the coils that are of none."""
-        for frame, body in zip(frames, bodies, strict=True):
-            if body.result.fit is not None:
-                yield frame, body.result.fit
-        grouped = {row for body in bodies for row in body.rows.tolist()}
+        yield from ((body.frame, body.fit) for body in bodies if body.fit is not None)
+        grouped = {row for body in bodies for row in body.frame.rows.tolist()}
         stamp_ns = coils[0].estimate.stamp_ns
         for row, (estimate, found, _, among_metal, _) in enumerate(coils):
             if found is not None and row not in grouped and not among_metal:
                 one = rigid.BodyCoils.single(float(self._scene.table.length[row]))
-                own = found.position[None], found.axis[None], found.normal[None]
                 frame = BodyFrame(
                     estimate.name, stamp_ns, values[row : row + 1], context, self.settings, one,
-                    [], own, self._past.coils.rules,
+                    [], np.array([row]), ended, self._past.coils.rules,
                 )  # fmt: skip
                 turn = rotation_of_quaternion(np.array(quaternion_of_axis(found.axis)))
                 yield frame, solve_with(frame, np.zeros(1, np.int64), (found.position, turn))
