@@ -31,8 +31,8 @@ from anser_ros.errors import ParameterError
 
 PACKAGE = Path(__file__).parent
 _CONFIG: Any = numba.config
-DECORATOR = b'\n@kernel'
-"""What stands before every kernel."""
+DECORATOR, PART = b'\n@kernel', b'\n@inlined'
+"""What stands before every kernel, and before every function that is a part of kernels."""
 MOST_STATES = 4
 """States of the sources whose kernels are kept, the last compiled: each has about 10 MB."""
 
@@ -85,9 +85,9 @@ def _copy_sources(folder: Path) -> bool:
 
 
 def _sources() -> dict[Path, bytes]:
-    """The text of every source file with kernels."""
+    """The text of every source file with kernels or parts of them."""
     texts = {path: path.read_bytes() for path in sorted(PACKAGE.rglob('*.py'))}
-    return {path: text for path, text in texts.items() if DECORATOR in text}
+    return {path: text for path, text in texts.items() if DECORATOR in text or PART in text}
 
 
 @functools.cache
