@@ -18,6 +18,7 @@ from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
 from anser_ros.pose_states import OK, RESIDUAL
 from anser_ros.sessions.follower import parse_references, with_references
+from anser_ros.sessions.mountings import mounting_words
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.sessions.tracked_session import (
@@ -282,6 +283,7 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     notes = (
         *sessions.snapshot_notes(args.model, model),
         *output.loss_notes(session, baseline),
+        *mounting_words(session),
         *((_few_notes(session) if args.refit else ()) or why),
         *((f'emitters differ from the model, tools say: {strengths}',) if strengths else ()),
     )

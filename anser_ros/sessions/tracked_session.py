@@ -24,6 +24,7 @@ from anser_ros.physics.rotations import axis_angles, rotation_angles
 from anser_ros.pose_states import OK
 from anser_ros.sessions.baseline import check_place
 from anser_ros.sessions.follower import ModelFollower, RefitSummary
+from anser_ros.sessions.mountings import mountings
 from anser_ros.sessions.prepared import PreparedSession, prepare, with_truth
 from anser_ros.sessions.session import Session, frames_of, settings_for
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
@@ -203,16 +204,42 @@ def track_session(
     finished share, 0 to 1. Raises `BagError` when the session has no tool fluxes, or a refit lacks
     references or a baseline; `ParameterError` for a baseline without a refit; `ModelFileError`
     when the model's emitters are not the session's, or its references locate the board elsewhere,
-    which is not checked with the gate switched off.
+    which is not checked with the gate switched off. Parts of several mountings are tracked each by
+    itself, but with a refit.
     """
     if baseline is not None and not refit:
         raise ParameterError('a baseline is of a refit, and has no effect without one')
     if settings is None or settings.has_gate:
         check_place(model, session)
     used = in_phase_model(model) if in_phase else model
-    prepared = prepare(session, used, baseline)
-    follower = ModelFollower(prepared, witnesses) if refit else None
-    return track(prepared, settings, follower, in_phase, progress)
+    found = list[Evaluation]()
+    for part in (session,) if refit else mountings(session):
+        prepared = prepare(part, used, baseline)
+        follower = ModelFollower(prepared, witnesses) if refit else None
+        found.append(track(prepared, settings, follower, in_phase, progress))
+    return found[0] if len(found) == 1 else _one_after_another(found)
+
+
+def _one_after_another(found: Sequence[Evaluation]) -> Evaluation:
+    """The evaluations of a session's parts as one."""
+
+    def joined(kind: str) -> dict[str, PoseSeries]:
+        groups = [one.groups.get(kind, {}) for one in found]
+        every = {
+            name: [g[name] for g in groups if name in g] for group in groups for name in group
+        }
+        return {
+            name: PoseSeries(
+                name,
+                tuple(estimate for one in parts for estimate in one.estimates),
+                np.concatenate([one.position_error for one in parts]),
+                np.concatenate([one.orientation_error for one in parts]),
+            )
+            for name, parts in every.items()
+        }
+
+    further = {kind: joined(kind) for one in found for kind in one.further}
+    return replace(found[-1], sensors=joined('sensors'), bodies=joined('bodies'), further=further)
 
 
 def _compared(
