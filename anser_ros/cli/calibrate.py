@@ -20,7 +20,6 @@ from anser_ros.errors import FitError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.calibration import calibrate_sessions, check_same_board, named_kinds
-from anser_ros.sessions.mountings import mounting_words
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import save_model
 
@@ -97,12 +96,7 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     save_model(args.out, calibration.model)
     return output.Result(
         document,
-        (
-            *output.loss_notes(*sessions),
-            *mounting_words(*sessions),
-            *document['unobservable'],
-            *document['contradictions'],
-        ),
+        (*output.loss_notes(*sessions), *document['unobservable'], *document['contradictions']),
         (_table(calibration, document), *_populations(calibration)),
         tuple(filter(None, (args.out, args.report))),
     )

@@ -18,7 +18,6 @@ from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
 from anser_ros.pose_states import OK, RESIDUAL
 from anser_ros.sessions.follower import parse_references, with_references
-from anser_ros.sessions.mountings import mounting_words
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.sessions.tracked_session import (
@@ -283,8 +282,8 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     notes = (
         *sessions.snapshot_notes(args.model, model),
         *output.loss_notes(session, baseline),
-        *mounting_words(session),
         *((_few_notes(session) if args.refit else ()) or why),
+        *evaluation.disagreements,
         *((f'emitters differ from the model, tools say: {strengths}',) if strengths else ()),
     )
     return output.Result(document, notes, tuple(shown), tuple(written))
@@ -311,7 +310,8 @@ def why_withheld(model: FieldModel, evaluation: Evaluation) -> tuple[str, ...]:
     found = Counter(pose.state for pose in poses)
     worst, count = max(found.items(), key=lambda one: (one[0] != OK, one[1]), default=(OK, 0))
     is_other = worst == RESIDUAL and known and 2 * count > len(poses)
-    if worst == OK or (found[OK] > HARDLY * len(poses) and not is_other):
+    of_bodies = any(body.ok.mean() > HARDLY for body in evaluation.bodies.values())
+    if worst == OK or ((of_bodies or found[OK] > HARDLY * len(poses)) and not is_other):
         return ()
     reasons = [pose.reason for pose in poses if pose.state == worst and pose.reason]
     such = f' ({reasons[len(reasons) // 2]})' if reasons else ''

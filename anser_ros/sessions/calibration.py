@@ -37,7 +37,6 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.field.nominal import nominal_model
 from anser_ros.sessions.baseline import readings_of
 from anser_ros.sessions.drawn_calibration import fit_to_drawing, is_for_drawing
-from anser_ros.sessions.mountings import mountings
 from anser_ros.sessions.nominal_board import NominalBoard, board_of
 from anser_ros.sessions.session import Session, shifted
 from anser_ros.sessions.starting_model import made_for
@@ -413,7 +412,7 @@ def calibrate_sessions(
     session's setup states how accurate fluxes and poses are. A session of several mountings counts
     as several.
     """
-    sessions = [part for session in sessions for part in mountings(session)]
+    sessions = [part for session in sessions for part in session.mountings()]
     setup = sessions[0].setup
     surveyed_m = setup.stated.get('tool_coil_position_m', options.surveyed_m)
     options = replace(options, accuracy=setup.accuracy, surveyed_m=surveyed_m)

@@ -18,6 +18,7 @@ from anser_ros.errors import PlausibilityError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.physics.rotations import TURNED_RAD, rotation_angles, unturned
 from anser_ros.refit.clouds import FieldFunction
 from anser_ros.sessions.nominal_board import NominalBoard, tracked_volume
 from anser_ros.wire.recorded import optical_stem
@@ -77,6 +78,11 @@ class Reading:
 
     def placed(self, position: Array, rotation: Array) -> tuple[Array, Array]:
         """Return positions (F, 3), m, and rotations (F, 3, 3) that are written so."""
+        # Loaded here, as each start of a node would pay for it that has no poses to read.
+        from scipy.spatial.transform import Rotation
+
+        read = Rotation.from_quat(Rotation.from_matrix(rotation).as_quat()[:, list(self.order)])
+        rotation = (read.inv() if self.is_inverse else read).as_matrix()
         turn = np.eye(3)[np.abs(self.axes) - 1] * np.sign(self.axes)[:, None]
         position = self.scale * position @ turn.T
         if not self.is_frame:
@@ -170,14 +176,8 @@ def _fit(
     """Share of readings (P,) that fit when poses are read so, and the fluxes' common factor."""
     flux = tool.flux[rows, columns]
     frames, where = np.unique(rows, return_inverse=True)
-    # Loaded here, as each start of a node would pay for it that has no poses to read.
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_quat(
-        Rotation.from_matrix(tool.rotation[frames]).as_quat()[:, list(reading.order)]
-    )
-    rotation = (turn.inv() if reading.is_inverse else turn).as_matrix()
-    centres, axes = tool.sensors.placed(*reading.placed(tool.position[frames], rotation))
+    placed = reading.placed(tool.position[frames], tool.rotation[frames])
+    centres, axes = tool.sensors.placed(*placed)
     predicted = np.einsum('pki,pi->pk', drawn(centres[where, columns]), axes[where, columns])
     size = np.einsum('pk,pk->p', predicted, predicted)
     ratio = np.einsum('pk,pk->p', predicted, flux) / np.maximum(size, 1e-300)
@@ -246,9 +246,9 @@ def plausible_tools(
 ) -> tuple[tuple[Measurements, ...], str]:
     """Check a recording's tools, and leave out the poses of an optical tracker that stood still.
 
-    ``refused`` is what the reader refused, ``topic: reason``, and how often. What was left out or
-    refused is returned in words; empty when nothing was. Raises `PlausibilityError` with the
-    evidence, in one line.
+    ``refused`` is what the reader refused, ``topic: reason``, and how often. What was left out,
+    refused or mounted otherwise is returned in words; empty when nothing was. Raises
+    `PlausibilityError` with the evidence, in one line.
     """
     nominal, kept, words = NominalBoard.of(setup), [], []
     driven = [np.nan_to_num(tool.flux).any(axis=(0, 1)) for tool in tools]
@@ -266,6 +266,10 @@ def plausible_tools(
         words += remarks
         check_conventions(path, setup, nominal, thawed)
         check_distance(path, setup, thawed)
+        if times := ', '.join(f'{time:.4g}' for time in times_of_mounting(thawed)):
+            words.append(
+                f'{tool.body} turns about another axis, mounted otherwise, from {times} s on'
+            )
         kept.append(thawed)
     return tuple(kept), '; '.join(words)
 
@@ -401,3 +405,41 @@ def check_distance(path: str, setup: Setup, tool: Measurements) -> None:
             f'{path}: optical positions of {tool.body} span {span:.3g} m and lie {distance:.3g} m '
             f'from the board, tools within {reach:.2g} m: {unit}?'
         )
+
+
+FAR_RAD = 0.35
+"""Turn, rad, about its axis of a body that a stage turns, and across it of one that was mounted
+otherwise: a hand that turns a tool so far turns it across the axis too, and without a jump."""
+FEWEST_MOUNTED = 10
+"""Poses without which a mounting is none: any few have an axis in common."""
+
+
+def times_of_mounting(tool: Measurements) -> list[float]:
+    """Return times, s, from which on a body, or the source, was mounted otherwise.
+
+    A stage turns a body about one axis, whose direction in fg stays the same; with another
+    mounting another one does.
+    """
+    time, rotation = tool.time[tool.has_pose], tool.rotation[tool.has_pose]
+    found, start = list[float](), 0
+    while start < len(time):
+        low, high = start + 1, len(time) + 1  # the part ends at the former, before the latter
+        while high - low > 1:
+            middle = (low + high) // 2
+            is_one = _across(rotation[start:middle], rotation[start:middle]) < TURNED_RAD
+            low, high = (middle, high) if is_one else (low, middle)
+        part, later = rotation[start:low], rotation[low : low + 1]
+        turned = rotation_angles(part[0].T @ part).max()
+        if min(turned, _across(part, later)) < FAR_RAD or low - start < FEWEST_MOUNTED:
+            return []
+        found += [float(time[start])] * (start > 0)
+        start = low
+    return found
+
+
+def _across(part: Array, rotation: Array) -> float:
+    """How far some rotations are across the axis that others keep; infinite without either."""
+    ways = unturned(part.mean(axis=0))[:1].T
+    if not ways.size or not len(rotation):
+        return np.inf
+    return float(np.abs(rotation @ ways - (part @ ways).mean(axis=0)).max())

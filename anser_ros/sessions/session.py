@@ -15,7 +15,7 @@ from anser_ros.frames.intake import GOOD, reading_codes
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable, Windings
 from anser_ros.sessions.nominal_board import tracked_volume
-from anser_ros.sessions.plausibility import plausible_tools
+from anser_ros.sessions.plausibility import plausible_tools, times_of_mounting
 from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.wire.points import STALE
@@ -55,6 +55,26 @@ class Session:
     def with_stated(self, stated: Mapping[str, float]) -> 'Session':
         """Return the session with values stated before its setup's; raises `ParameterError`."""
         return replace(self, setup=self.setup.with_stated(stated))
+
+    def mountings(self) -> 'tuple[Session, ...]':
+        """Return the parts in which all was mounted alike, sessions of their own; or itself.
+
+        How exactly a fixture holds a body, or the source, is of each mounting.
+        """
+        starts = sorted({time for tool in self.tools for time in times_of_mounting(tool)})
+        ends = zip([-np.inf, *starts], [*starts, np.inf], strict=True)
+        return tuple(self._between(*own) for own in ends) if starts else (self,)
+
+    def _between(self, begin: float, end: float) -> 'Session':
+        """The frames from a time to before another, s, under a name that says so."""
+        name = f'{self.path} from {max(begin, 0.0):.4g} s on'
+
+        def own(measured: Measurements) -> Measurements:
+            inside = (measured.time >= begin) & (measured.time < end)
+            return replace(measured.frames(inside), session=name)
+
+        reference = None if self.reference is None else own(self.reference)
+        return replace(self, path=name, tools=tuple(map(own, self.tools)), reference=reference)
 
 
 def sensor_table(specs: tuple[SensorSpec, ...]) -> SensorTable:

@@ -23,8 +23,8 @@ from anser_ros.fingerprint import fingerprint_of
 from anser_ros.physics.rotations import axis_angles, rotation_angles
 from anser_ros.pose_states import OK
 from anser_ros.sessions.baseline import check_place
+from anser_ros.sessions.disagreement import disagreement
 from anser_ros.sessions.follower import ModelFollower, RefitSummary
-from anser_ros.sessions.mountings import mountings
 from anser_ros.sessions.prepared import PreparedSession, prepare, with_truth
 from anser_ros.sessions.session import Session, frames_of, settings_for
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
@@ -93,12 +93,13 @@ def track(
                     further[observer.KIND].setdefault(body, []).append(estimate)
         if progress is not None:
             progress(count / len(frames))
-    sensors, bodies = _compared(prepared, estimates)
+    sensors, bodies, words = _compared(prepared, estimates)
     found_by = {one.KIND: one for one in observers if further[one.KIND]}
     others = {kind: one.compare(prepared, further[kind]) for kind, one in found_by.items()}
     others = {kind: series for kind, series in others.items() if series}
     summary = None if follower is None else follower.summary
-    return Evaluation(sensors, bodies, summary, others, half.tracker.emitter_strengths)
+    strengths = half.tracker.emitter_strengths
+    return Evaluation(sensors, bodies, summary, others, strengths, words)
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,14 @@ class PoseSeries:
     def ok(self) -> Booleans:
         """Return the mask (F,) of the frames in which a pose was given."""
         return np.array([estimate.state == OK for estimate in self.estimates], dtype=bool)
+
+    def followed_by(self, later: 'PoseSeries') -> 'PoseSeries':
+        """Return the series with the frames of another after its own."""
+        position, orientation = (
+            np.concatenate([getattr(one, f'{kind}_error') for one in (self, later)])
+            for kind in ('position', 'orientation')
+        )
+        return PoseSeries(self.name, self.estimates + later.estimates, position, orientation)
 
 
 def pose_series(
@@ -176,9 +185,9 @@ class Evaluation:
     bodies: dict[str, PoseSeries]
     refit: RefitSummary | None = None
     further: dict[str, dict[str, PoseSeries]] = field(default_factory=dict)
-    strengths: str = (
-        ''  # How emitters differed from the model at the end, in words, where they did
-    )
+    # How emitters differed from the model at the end, in words, where they did
+    strengths: str = ''
+    disagreements: tuple[str, ...] = ()  # of bodies' poses with the optical ones as a whole
 
     @property
     def groups(self) -> dict[str, dict[str, PoseSeries]]:
@@ -213,7 +222,7 @@ def track_session(
         check_place(model, session)
     used = in_phase_model(model) if in_phase else model
     found = list[Evaluation]()
-    for part in (session,) if refit else mountings(session):
+    for part in (session,) if refit else session.mountings():
         prepared = prepare(part, used, baseline)
         follower = ModelFollower(prepared, witnesses) if refit else None
         found.append(track(prepared, settings, follower, in_phase, progress))
@@ -222,32 +231,24 @@ def track_session(
 
 def _one_after_another(found: Sequence[Evaluation]) -> Evaluation:
     """The evaluations of a session's parts as one."""
-
-    def joined(kind: str) -> dict[str, PoseSeries]:
-        groups = [one.groups.get(kind, {}) for one in found]
-        every = {
-            name: [g[name] for g in groups if name in g] for group in groups for name in group
-        }
-        return {
-            name: PoseSeries(
-                name,
-                tuple(estimate for one in parts for estimate in one.estimates),
-                np.concatenate([one.position_error for one in parts]),
-                np.concatenate([one.orientation_error for one in parts]),
-            )
-            for name, parts in every.items()
-        }
-
-    further = {kind: joined(kind) for one in found for kind in one.further}
-    return replace(found[-1], sensors=joined('sensors'), bodies=joined('bodies'), further=further)
+    groups: dict[str, dict[str, PoseSeries]] = {}
+    for kind, group in (pair for one in found for pair in one.groups.items()):
+        own = groups.setdefault(kind, {})
+        for name, series in group.items():
+            own[name] = own[name].followed_by(series) if name in own else series
+    words = tuple(words for one in found for words in one.disagreements)
+    return Evaluation(
+        groups.pop('sensors'), groups.pop('bodies'), None, groups, found[-1].strengths, words
+    )
 
 
 def _compared(
     prepared: PreparedSession, estimates: Mapping[str, Sequence[PoseEstimate]]
-) -> tuple[dict[str, PoseSeries], dict[str, PoseSeries]]:
+) -> tuple[dict[str, PoseSeries], dict[str, PoseSeries], tuple[str, ...]]:
     """Compare sensors and bodies with the optical poses, as the model's corrections place them."""
     sensors: dict[str, PoseSeries] = {}
     bodies: dict[str, PoseSeries] = {}
+    words: tuple[str, ...] = ()
     for tool in prepared.session.tools:
         true = with_truth(tool, prepared.correction)
         position = np.where(true.has_pose[:, None], true.position, np.nan)
@@ -258,7 +259,9 @@ def _compared(
         if tool.body in estimates:
             given = estimates[tool.body]
             bodies[tool.body] = pose_series(tool.body, given, position, true.rotation)
-    return sensors, bodies
+            where = f'{prepared.session.path}: {tool.body}'
+            words += disagreement(where, given, (position, true.rotation))
+    return sensors, bodies, words
 
 
 SCHEMA = 'anser_evaluation/1'

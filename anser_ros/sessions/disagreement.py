@@ -1,0 +1,95 @@
+"""Says in words how poses and the reference that they are compared with disagree as a whole.
+
+Errors say how far; here is what all of them have in common: another frame, another mounting of the
+body, or poses that were written in another way. It is said, and nothing is corrected.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from anser_ros.arrays import Array
+from anser_ros.physics.constants import DEGREES
+from anser_ros.physics.rotations import nearest_rotation, rotation_angles
+from anser_ros.pose_states import OK
+from anser_ros.sessions.plausibility import OTHER_READINGS
+from anser_ros.tracking.estimate import PoseEstimate
+
+FEWEST_POSES = 10
+"""Poses without which nothing is said: few have a shift in common by chance."""
+APART = 3.0
+"""Sigmas of a pose beyond which all poses stand aside, as no noise and no place makes them."""
+EXPLAINED = 0.5
+"""Share of the error that may be left by what explains it: four fifths of its power are gone."""
+GROSS_M, GROSS_RAD = 5e-3, np.radians(5.0)
+"""Median errors that no tracker of this kind has: something was stated wrongly."""
+ARM_M = 0.1
+"""Distance, m, at which a turn is compared with a shift: the size of a hand, or a tool."""
+
+Poses = tuple[Array, Array]
+"""Positions (F, 3), m, and rotations (F, 3, 3) to fg."""
+
+
+def disagreement(name: str, estimates: Sequence[PoseEstimate], true: Poses) -> tuple[str, ...]:
+    """Return a line on a body's F poses and the reference's, where all disagree alike, or grossly.
+
+    The reference's are NaN where there is none.
+    """
+    known = np.isfinite(true[0]).all(axis=1).tolist()
+    rows = [i for i, e in enumerate(estimates) if known[i] and e.state == OK]
+    if len(rows) < FEWEST_POSES:
+        return ()
+    poses = [estimates[i] for i in rows]
+    given = np.array([p.position for p in poses]), np.array([p.rotation for p in poses])
+    true = true[0][rows], true[1][rows]
+    power = np.array([p.covariance.diagonal() for p in poses]).reshape(-1, 2, 3).sum(axis=2)
+    sigma = np.median(np.sqrt(power), axis=0)
+    apart = _apart(given, true)
+    size, limit = _size(apart), np.maximum(2.0 * APART * sigma, [GROSS_M, GROSS_RAD])
+    is_gross = bool((np.median(apart, axis=0) > limit).any())
+    found = [*_frames(given, true)]
+    found += [(r.placed(*true), f'read as {r.words}') for r in OTHER_READINGS if is_gross]
+    each = [(_size(_apart(given, other)), words) for other, words in found]
+    left, words = min(each, key=lambda one: one[0] @ [1.0, ARM_M])
+    is_less = is_gross or ((left < EXPLAINED * size) & (size > APART * sigma)).any()
+    if is_less and (left < limit).all():
+        words = f'{words}, {_words(*left)}'
+    elif is_gross:
+        words = 'no frame, mounting, unit or order of axes explains that'
+    else:
+        return ()
+    return (f'{name}: the reference is {_words(*size)} rms off the poses; {words}',)
+
+
+def _frames(given: Poses, true: Poses) -> Iterator[tuple[Poses, str]]:
+    """The reference's poses in another frame, and as those of a body mounted otherwise."""
+    (place, turn), (position, rotation) = given, true
+    back, shift = np.swapaxes(rotation, 1, 2), (place - position).mean(axis=0)
+    frame, mount = (nearest_rotation(m.mean(axis=0)) for m in (turn @ back, back @ turn))
+    arm = np.einsum('fij,fj->i', back, place - position) / len(place)
+    middle = position.mean(axis=0)
+    there = (position - middle) @ frame.T + middle + shift, frame @ rotation
+    yield (
+        there,
+        f'in a frame that is {_words(np.linalg.norm(shift), rotation_angles(frame))} beside fg',
+    )
+    there = position + rotation @ arm, rotation @ mount
+    yield (
+        there,
+        f'on a body mounted {_words(np.linalg.norm(arm), rotation_angles(mount))} otherwise',
+    )
+
+
+def _apart(given: Poses, true: Poses) -> Array:
+    """Distances, m, and angles, rad, between poses, (F, 2)."""
+    angle = rotation_angles(np.swapaxes(true[1], 1, 2) @ given[1])
+    return np.stack([np.linalg.norm(given[0] - true[0], axis=1), angle], axis=1)
+
+
+def _size(apart: Array) -> Array:
+    return np.asarray(np.sqrt(np.mean(apart**2, axis=0)))
+
+
+def _words(metres: Any, radians: Any) -> str:
+    return f'{1e3 * metres:.3g} mm and {DEGREES * radians:.3g} deg'
