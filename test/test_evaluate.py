@@ -18,12 +18,16 @@ from anser_ros.cli.calibrate import population_figure, population_table, populat
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.field.model import EffectRecord
+from anser_ros.physics.rotations import rotation_of_vector
 from anser_ros.pose_states import OK
+from anser_ros.sessions import session
 from anser_ros.sessions.baseline import baseline_flux
+from anser_ros.sessions.disagreement import disagreement
 from anser_ros.sessions.follower import RefitSummary, parse_references, with_references
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
 from anser_ros.sessions.tracked_session import Evaluation, PoseSeries, to_document, track_session
+from anser_ros.settings import Accuracy
 from anser_ros.tracking.estimate import TrackerSettings
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
@@ -128,6 +132,46 @@ def test_the_truth_is_what_the_model_s_effects_make_of_it(model, moving, record,
     expected = np.full(len(apart), moved_m) if moved_m else np.where(later[2], apart, np.nan)
     assert np.nanmax(expected) > 5e-3
     np.testing.assert_allclose(body.position_error, expected, atol=1.5e-3)
+
+
+def test_what_all_poses_and_the_reference_have_between_them_is_said(moving):
+    (body,) = moving.bodies.values()
+    place = np.array([estimate.position for estimate in body.estimates])
+    turn = np.array([estimate.rotation for estimate in body.estimates])
+    quarter = rotation_of_vector(np.array([0.0, 0.5 * np.pi, 0.0]))
+
+    def said(position, rotation):
+        return ' '.join(disagreement('tool', body.estimates, (position, rotation), Accuracy()))
+
+    assert moving.disagreements == () and said(place, turn) == ''
+    assert said(place + [1e-4, 0.0, 0.0], turn) == ''  # three sigma are more
+    assert 'in a frame that is 2.00 mm and 0.00 deg beside fg, ' in said(
+        place + [0, 2e-3, 0], turn
+    )
+    assert '90.00 deg beside fg, 0.00 mm' in said(place @ quarter.T + 0.5, quarter @ turn)
+    arm = place + turn @ [0.0, 0.0, 0.02]
+    assert 'on a body mounted 20.00 mm and 90.00 deg otherwise' in said(arm, turn @ quarter)
+    assert 'read as positions in millimetres' in said(1e3 * place, turn)
+    assert 'read as rotations from fg to the body' in said(place, np.swapaxes(turn, 1, 2))
+    words = said(place[::-1], turn[::-1])
+    assert 'no frame, mounting, unit or order of axes explains that' in words
+    assert said(np.full_like(place, np.nan), turn) == ''
+
+
+def test_parts_of_several_mountings_are_tracked_one_after_the_other(model, moving, monkeypatch):
+    recorded = load_session(BAGS / 'moving.mcap')
+    middle = recorded.tools[0].time[100]
+    monkeypatch.setattr(session, 'times_of_mounting', lambda tool: [middle])
+    found = track_session(recorded, load_model(model))
+    assert found.groups.keys() == moving.groups.keys()
+    for kind, group in moving.groups.items():
+        for name, whole in group.items():
+            parts = found.groups[kind][name]
+            assert [e.stamp_ns for e in parts.estimates] == [e.stamp_ns for e in whole.estimates]
+            both = parts.ok & whole.ok
+            assert both.mean() > 0.97
+            apart = np.abs(parts.position_error - whole.position_error)[both]
+            assert np.median(apart) < 1e-5
 
 
 def test_a_baseline_whose_references_are_elsewhere_is_refused():

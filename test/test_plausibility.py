@@ -15,7 +15,13 @@ from anser_ros.errors import DiagnosisError, PlausibilityError
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.sessions.diagnosis import diagnose_session
 from anser_ros.sessions.nominal_board import NominalBoard
-from anser_ros.sessions.plausibility import FLUX_UNITS, LENGTH_UNITS, check_points, plausible_tools
+from anser_ros.sessions.plausibility import (
+    FLUX_UNITS,
+    LENGTH_UNITS,
+    check_points,
+    plausible_tools,
+    times_of_mounting,
+)
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import load_model
 from anser_ros.sessions.tracked_session import track_session
@@ -23,6 +29,7 @@ from anser_ros.wire.bag import read_bag
 from anser_ros.wire.bag_writer import SessionWriter
 
 MODEL = REPO / 'config' / 'demo_model.yaml'
+SEED = 5
 
 
 @pytest.fixture(scope='module')
@@ -197,6 +204,33 @@ def test_commands_say_it_in_one_line(tmp_path, capsys):
         assert main(command) == 2
         said = capsys.readouterr().err
         assert 'millimetres' in said and said.count('\n') == 1, said
+
+
+def test_a_body_that_a_stage_turns_is_mounted_otherwise_where_its_axis_jumps(moving, tool, rng):
+    def mounted(*held, turn=90.0, jitter=2e-3):
+        """The tool turned about fg's z in steps, on mounts of these Euler angles, deg."""
+        part = len(tool.time) // len(held)
+        spin = Rotation.from_rotvec(np.outer(np.radians(np.linspace(0.0, turn, part)), [0, 0, 1]))
+        mounts = [spin * Rotation.from_euler('xyz', one, degrees=True) for one in held]
+        wrong = Rotation.from_rotvec(jitter * rng.normal(size=(part * len(held), 3)))
+        quaternion = (wrong * Rotation.concatenate(mounts)).as_quat()
+        rows = tool.frames(slice(0, len(quaternion)))
+        track = PoseTrack(rows.time, rows.position, quaternion)
+        return replace(rows, track=track).with_track(track)
+
+    home, down, side = (0, 0, 0), (90, 0, 0), (0, 90, 0)
+    three = mounted(home, down, side)
+    starts = three.time[[len(three.time) // 3, 2 * (len(three.time) // 3)]].tolist()
+    assert times_of_mounting(three) == starts
+    # A turn about the axis itself is none, nor is what hardly turns, or a hand's motion.
+    for one in (mounted(home), mounted(home, (0, 0, 90)), mounted(home, down, turn=5.0), tool):
+        assert times_of_mounting(one) == []
+    assert f'{tool.body} turns about another axis' in checked(moving, three)[1]
+    first, *others = replace(moving, tools=(three,)).mountings()
+    assert [part.tools[0].time[0] for part in others] == starts
+    assert first.path == f'{moving.path} from 0 s on' == first.tools[0].session
+    assert sum(len(part.tools[0].time) for part in (first, *others)) == len(three.time)
+    assert moving.mountings() == (moving,)
 
 
 def test_points_of_an_error_map():

@@ -14,12 +14,13 @@ from anser_ros.physics.constants import DEGREES
 from anser_ros.physics.rotations import nearest_rotation, rotation_angles
 from anser_ros.pose_states import OK
 from anser_ros.sessions.plausibility import OTHER_READINGS
+from anser_ros.settings import Accuracy
 from anser_ros.tracking.estimate import PoseEstimate
 
 FEWEST_POSES = 10
 """Poses without which nothing is said: few have a shift in common by chance."""
 APART = 3.0
-"""Sigmas of a pose beyond which all poses stand aside, as no noise and no place makes them."""
+"""Sigmas of a pose and the reference beyond which all poses stand aside: no noise makes that."""
 EXPLAINED = 0.5
 """Share of the error that may be left by what explains it: four fifths of its power are gone."""
 GROSS_M, GROSS_RAD = 5e-3, np.radians(5.0)
@@ -31,10 +32,12 @@ Poses = tuple[Array, Array]
 """Positions (F, 3), m, and rotations (F, 3, 3) to fg."""
 
 
-def disagreement(name: str, estimates: Sequence[PoseEstimate], true: Poses) -> tuple[str, ...]:
+def disagreement(
+    name: str, estimates: Sequence[PoseEstimate], true: Poses, accuracy: Accuracy
+) -> tuple[str, ...]:
     """Return a line on a body's F poses and the reference's, where all disagree alike, or grossly.
 
-    The reference's are NaN where there is none.
+    The reference's are NaN where there is none, and as accurate as is stated.
     """
     known = np.isfinite(true[0]).all(axis=1).tolist()
     rows = [i for i, e in enumerate(estimates) if known[i] and e.state == OK]
@@ -44,7 +47,8 @@ def disagreement(name: str, estimates: Sequence[PoseEstimate], true: Poses) -> t
     given = np.array([p.position for p in poses]), np.array([p.rotation for p in poses])
     true = true[0][rows], true[1][rows]
     power = np.array([p.covariance.diagonal() for p in poses]).reshape(-1, 2, 3).sum(axis=2)
-    sigma = np.median(np.sqrt(power), axis=0)
+    own = 3.0 * np.square([accuracy.optical_position_m, accuracy.optical_rotation_rad])
+    sigma = np.median(np.sqrt(power + own), axis=0)
     apart = _apart(given, true)
     size, limit = _size(apart), np.maximum(2.0 * APART * sigma, [GROSS_M, GROSS_RAD])
     is_gross = bool((np.median(apart, axis=0) > limit).any())
@@ -92,4 +96,4 @@ def _size(apart: Array) -> Array:
 
 
 def _words(metres: Any, radians: Any) -> str:
-    return f'{1e3 * metres:.3g} mm and {DEGREES * radians:.3g} deg'
+    return f'{1e3 * metres:.2f} mm and {DEGREES * radians:.2f} deg'

@@ -248,7 +248,7 @@ def _compared(
     """Compare sensors and bodies with the optical poses, as the model's corrections place them."""
     sensors: dict[str, PoseSeries] = {}
     bodies: dict[str, PoseSeries] = {}
-    words: tuple[str, ...] = ()
+    words, accuracy = tuple[str, ...](), prepared.session.setup.accuracy
     for tool in prepared.session.tools:
         true = with_truth(tool, prepared.correction)
         position = np.where(true.has_pose[:, None], true.position, np.nan)
@@ -260,7 +260,7 @@ def _compared(
             given = estimates[tool.body]
             bodies[tool.body] = pose_series(tool.body, given, position, true.rotation)
             where = f'{prepared.session.path}: {tool.body}'
-            words += disagreement(where, given, (position, true.rotation))
+            words += disagreement(where, given, (position, true.rotation), accuracy)
     return sensors, bodies, words
 
 

@@ -13,6 +13,7 @@ from anser_ros.apps.lab.cli import measured
 from anser_ros.apps.lab.measured import hpi_coils, ilemt, navion
 from anser_ros.cli.main import main
 from anser_ros.errors import FitError
+from anser_ros.sessions.plausibility import times_of_mounting
 from anser_ros.sessions.session import load_session
 
 SEED = 7
@@ -192,6 +193,12 @@ class TestIlemt:
         assert len(bags) == 2 * (3 + 3 + 3 + 6) + 2 * 4 + 8
         (tool,) = load_session(bags[0]).tools
         assert tool.flux.shape == (142, 3, 3) and tool.has_pose.all()
+        # Three fixtures in one recording are told by the axis that the body turns about.
+        parts = [load_session(bag).tools[0] for bag in bags[:3]]
+        joined = np.concatenate([part.rotation for part in parts])
+        time = np.arange(len(joined), dtype=float)
+        ends = {'time': time, 'rotation': joined, 'has_pose': time >= 0.0}
+        assert times_of_mounting(replace(tool, **ends)) == [142.0, 284.0]
         (other,) = load_session(next(b for b in bags if 'turned_ZoutYup' in b.stem)).tools
         # The source's fixture turns: what was before it is beside it.
         turned = other.position.mean(axis=0) / np.linalg.norm(other.position.mean(axis=0))
