@@ -50,6 +50,10 @@ class Measurements:
         each = ('time', 'flux', 'valid', 'flags', 'position', 'rotation', 'has_pose')
         return replace(self, **{name: getattr(self, name)[rows] for name in each})
 
+    def between(self, begin: float, end: float) -> 'Measurements':
+        """Return the frames from a time to before another, s."""
+        return self.frames((self.time >= begin) & (self.time < end))
+
     def with_track(self, track: PoseTrack) -> 'Measurements':
         """Return the measurements with the poses that another track has at their times."""
         position, rotation, has_pose = track.at(self.time)

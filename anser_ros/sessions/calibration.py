@@ -219,8 +219,7 @@ def _near(learnt: cKDTree, tool: Measurements) -> Measurements:
 
 def _between(measurements: Measurements, begin: float, end: float) -> Measurements:
     """The frames between two times, the first of which becomes zero."""
-    inside = (measurements.time >= begin) & (measurements.time <= end)
-    return shifted(measurements.frames(inside), -begin)
+    return shifted(measurements.between(begin, end), -begin)
 
 
 Sessions = Sequence[Session]

@@ -69,26 +69,21 @@ def disagreement(
 def _frames(given: Poses, true: Poses) -> Iterator[tuple[Poses, str]]:
     """The reference's poses in another frame, and as those of a body mounted otherwise."""
     (place, turn), (position, rotation) = given, true
-    back, shift = np.swapaxes(rotation, 1, 2), (place - position).mean(axis=0)
+    back, off = np.swapaxes(rotation, 1, 2), place - position
     frame, mount = (nearest_rotation(m.mean(axis=0)) for m in (turn @ back, back @ turn))
-    arm = np.einsum('fij,fj->i', back, place - position) / len(place)
-    middle = position.mean(axis=0)
-    there = (position - middle) @ frame.T + middle + shift, frame @ rotation
-    yield (
-        there,
-        f'in a frame that is {_words(np.linalg.norm(shift), rotation_angles(frame))} beside fg',
-    )
-    there = position + rotation @ arm, rotation @ mount
-    yield (
-        there,
-        f'on a body mounted {_words(np.linalg.norm(arm), rotation_angles(mount))} otherwise',
-    )
+    arm = np.einsum('fij,fj->i', back, off) / len(place)
+    words = _words(np.linalg.norm(off.mean(axis=0)), rotation_angles(frame))
+    there = (position - position.mean(axis=0)) @ frame.T + place.mean(axis=0)
+    yield (there, frame @ rotation), f'in a frame that is {words} beside fg'
+    words = _words(np.linalg.norm(arm), rotation_angles(mount))
+    yield (position + rotation @ arm, rotation @ mount), f'on a body mounted {words} otherwise'
 
 
 def _apart(given: Poses, true: Poses) -> Array:
     """Distances, m, and angles, rad, between poses, (F, 2)."""
-    angle = rotation_angles(np.swapaxes(true[1], 1, 2) @ given[1])
-    return np.stack([np.linalg.norm(given[0] - true[0], axis=1), angle], axis=1)
+    (place, turn), (position, rotation) = given, true
+    angle = rotation_angles(np.swapaxes(rotation, 1, 2) @ turn)
+    return np.stack([np.linalg.norm(place - position, axis=1), angle], axis=1)
 
 
 def _size(apart: Array) -> Array:

@@ -70,8 +70,7 @@ class Session:
         name = f'{self.path} from {max(begin, 0.0):.4g} s on'
 
         def own(measured: Measurements) -> Measurements:
-            inside = (measured.time >= begin) & (measured.time < end)
-            return replace(measured.frames(inside), session=name)
+            return replace(measured.between(begin, end), session=name)
 
         reference = None if self.reference is None else own(self.reference)
         return replace(self, path=name, tools=tuple(map(own, self.tools)), reference=reference)
