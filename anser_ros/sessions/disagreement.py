@@ -39,8 +39,8 @@ def disagreement(
 
     The reference's are NaN where there is none, and as accurate as is stated.
     """
-    known = np.isfinite(true[0]).all(axis=1).tolist()
-    rows = [i for i, e in enumerate(estimates) if known[i] and e.state == OK]
+    ok = np.array([estimate.state == OK for estimate in estimates])
+    rows = np.flatnonzero(ok & np.isfinite(true[0]).all(axis=1)).tolist()
     if len(rows) < FEWEST_POSES:
         return ()
     poses = [estimates[i] for i in rows]

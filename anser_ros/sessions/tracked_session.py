@@ -75,13 +75,11 @@ def track(
     settings = replace(settings, volume=settings.volume or prepared.volume)
     settings = settings_for(prepared.session.setup, settings, prepared.model)
     # A drift's recorded course is used if nothing follows it.
-    course = prepared.recorded_drift and follower is None
-    settings = replace(settings, recorded_drift=course)
+    settings = replace(settings, recorded_drift=prepared.recorded_drift and follower is None)
     tracker = Tracker(prepared.model, prepared.sensors, settings, observers)
     estimates: dict[str, list[PoseEstimate]] = {}
     further: dict[str, dict[str, list[PoseEstimate]]] = {one.KIND: {} for one in observers}
-    age_s = prepared.session.setup.refit.references_age_s
-    half = TrackingHalf(tracker, age_s)
+    half = TrackingHalf(tracker, prepared.session.setup.refit.references_age_s)
     chain = Chain(follower, half)
     frames = list(frames_of(prepared.session))
     for count, frame in enumerate(frames, start=1):
@@ -98,8 +96,7 @@ def track(
     others = {kind: one.compare(prepared, further[kind]) for kind, one in found_by.items()}
     others = {kind: series for kind, series in others.items() if series}
     summary = None if follower is None else follower.summary
-    strengths = half.tracker.emitter_strengths
-    return Evaluation(sensors, bodies, summary, others, strengths, words)
+    return Evaluation(sensors, bodies, summary, others, half.tracker.emitter_strengths, words)
 
 
 @dataclass(frozen=True)
@@ -118,11 +115,9 @@ class PoseSeries:
 
     def followed_by(self, later: 'PoseSeries') -> 'PoseSeries':
         """Return the series with the frames of another after its own."""
-        position, orientation = (
-            np.concatenate([getattr(one, f'{kind}_error') for one in (self, later)])
-            for kind in ('position', 'orientation')
-        )
-        return PoseSeries(self.name, self.estimates + later.estimates, position, orientation)
+        place = np.concatenate([self.position_error, later.position_error])
+        turn = np.concatenate([self.orientation_error, later.orientation_error])
+        return PoseSeries(self.name, self.estimates + later.estimates, place, turn)
 
 
 def pose_series(
@@ -226,20 +221,19 @@ def track_session(
         prepared = prepare(part, used, baseline)
         follower = ModelFollower(prepared, witnesses) if refit else None
         found.append(track(prepared, settings, follower, in_phase, progress))
-    return found[0] if len(found) == 1 else _one_after_another(found)
+    return _one_after_another(found)
 
 
 def _one_after_another(found: Sequence[Evaluation]) -> Evaluation:
     """The evaluations of a session's parts as one."""
     groups: dict[str, dict[str, PoseSeries]] = {}
     for kind, group in (pair for one in found for pair in one.groups.items()):
-        own = groups.setdefault(kind, {})
-        for name, series in group.items():
-            own[name] = own[name].followed_by(series) if name in own else series
+        whole = groups.setdefault(kind, {})
+        for name, part in group.items():
+            whole[name] = whole[name].followed_by(part) if name in whole else part
     words = tuple(words for one in found for words in one.disagreements)
-    return Evaluation(
-        groups.pop('sensors'), groups.pop('bodies'), None, groups, found[-1].strengths, words
-    )
+    bare, strengths = (groups.pop('sensors'), groups.pop('bodies')), found[-1].strengths
+    return Evaluation(*bare, found[0].refit, groups, strengths, words)
 
 
 def _compared(
