@@ -343,6 +343,20 @@ def received(world: World, size: float) -> Truth:
     return {'stamp_jitter': None}
 
 
+def leaning(world: World, size: float) -> Truth:
+    """Positions err, mm, by an even function of the direction of each sensor's z axis."""
+    shape = world.rng.normal(size=(3, 3, 3))
+
+    def change(name: str, rows: Stream) -> None:
+        axis = Rotation.from_quat(rows[2]).as_matrix()[:, :, 2]
+        rows[1] += 1e-3 * size * np.einsum('ijk,nj,nk->ni', shape, axis, axis)
+
+    turn = world._turn
+    world.follow(world._place, lambda time: 1.5 * turn(time))
+    _each(world, change)
+    return {'orientation_error': None}
+
+
 KINDS = {
     'late': Kind(stated('offset', 1e-3, 'time_offset', 'offset_s'), (8, 30, 100), ('offset',)),
     'fast': Kind(stated('rate_ppm', 1, 'clock_rate', 'rate_ppm'), (600, 1200, 2500), ('rate',)),
@@ -377,5 +391,6 @@ KINDS = {
     'stepped': Kind(stepped, (0.05, 0.11, 0.2), ('noise', 'tracked'), 3, ('range_noise',)),
     'through': Kind(through, (5, 9, 17), ('tracked', 'reference'), 1, ('time_offset',)),
     'own_errors': Kind(own_errors, (0.4, 0.8, 1.2), ('place',), 1, ('field_distortion',)),
+    'leaning': Kind(leaning, (1, 1.5, 2), ('place', 'tracked'), 2),
     'received': Kind(received, (4, 7, 10), ('stamps', 'tracked', 'reference')),
 }

@@ -101,12 +101,12 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
     unit = _unit(ratio)
     plain = PoseReading(unit=unit)
     as_written = plain.applied(session)
-    cost = _cost(as_written)
+    clock = start.coarse_clock(_few(as_written))  # which no reading of the tracked poses changes
+    cost = _cost(as_written, clock)
     record = None if plain.is_plain else plain.record(np.inf, cost, ratio)
-    is_turned = cost < POOR_M and _is_turned(as_written)
+    is_turned = cost < POOR_M and _is_turned(as_written, clock)
     if cost < POOR_M and not is_turned:
         return as_written, record
-    clock = start.coarse_clock(_few(as_written))  # which no reading of the tracked poses changes
     trials = [
         (_cost(reading.applied(session), None if reading.stream == REFERENCE else clock), reading)
         for reading in _readings(unit)
@@ -163,19 +163,18 @@ def _few(session: PoseSession) -> PoseProblem:
     return problem.rows([np.arange(0, poses.size, step) for poses in problem.sensors])
 
 
-def _cost(session: PoseSession, clock: Sequence[PoseTerm] | None = None) -> float:
+def _cost(session: PoseSession, clock: Sequence[PoseTerm] | None) -> float:
     problem = _few(session)
     return start.first_cost(start.first_fit(problem, clock or start.coarse_clock(problem), False))
 
 
-def _is_turned(session: PoseSession) -> bool:
+def _is_turned(session: PoseSession, clock: Sequence[PoseTerm]) -> bool:
     """Whether turns fit better if those of the tracker are read in the other sense.
 
     Half of all orders and senses fit alike: a turn of quaternions makes them of each other, and
     the other half is their mirror image.
     """
-    problem = start.pose_problem(session)
-    clock, misfits = start.coarse_clock(problem), []
+    problem, misfits = start.pose_problem(session), []
     for poses in problem.sensors:
         _, turn, _, known = problem.path.at(start.times_by(clock, poses))
         optical = Rotation.from_matrix(turn[known]).as_quat()

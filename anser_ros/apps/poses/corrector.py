@@ -223,7 +223,7 @@ class PoseCorrector:
         variance = self._sigma**2 + (GROWTH * away) ** 2
         for mapping in self._maps:
             # Outside it is held at the border: a polynomial knows nothing beyond it.
-            shift, spread = mapping(sensor, inside)
+            shift, spread = mapping(sensor, inside, Rotation.from_quat(turn).as_matrix())
             variance += spread
             place = place + shift
         covariance = np.diag(np.repeat([variance, self._turn**2], 3))

@@ -129,9 +129,7 @@ def _joined(states: list[PoseState]) -> PoseState:
 
 
 def _registered(frames: PoseFit, unseen: PoseProblem) -> list[Array]:
-    """Squared distances that registering the places of each sensor alone leaves, with no lever
-    arm; the rotations are those of a mount, which positions do not determine.
-    """
+    """Squared distances that registering the places of each sensor alone leaves."""
     squares = []
     for fitted, part in zip(frames.state.parts, unseen.state(frames.terms).parts, strict=True):
         optical, place = fitted.view.optical[fitted.used], fitted.view.measured[fitted.used]
@@ -421,11 +419,9 @@ def _confirmed(search: PoseSearch, problem: PoseProblem, test: Integers) -> Pose
 def unconfirmed(rest: PoseFit, fit: PoseFit, term: PoseTerm, unseen: PoseProblem) -> str:
     """Return why an effect is not believed beside the rest; empty where it is.
 
-    ``rest`` is the fit without it, and ``unseen`` the held-out poses.
-    Poses near each other err alike, and a few places may ask for what no others confirm. Where
-    stamps jitter, an error of places weighs little beside one across the velocity or of turns; a
-    map that moves poses but takes nothing off their errors makes up for frames that it has moved.
-    On a path that comes again, a tracker's own errors look like a small offset, lag or scale.
+    ``rest`` is the fit without it, and ``unseen`` the held-out poses. A map that moves poses but
+    takes nothing off their errors makes up for frames that it has moved; on a path that comes
+    again, a tracker's own errors look like a small offset, lag or scale.
     """
     taken = rest.state.rms(term.sensor)[0] ** 2 - fit.state.rms(term.sensor)[0] ** 2
     least = LEAST_MAP_M if term.role is Role.MAP else LEAST_REPORTED_M

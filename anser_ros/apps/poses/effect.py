@@ -103,8 +103,9 @@ class Frames:
     lever: Array  # (3,), the sensor in the body's frame, m
 
 
-PoseMap = Callable[[str, Array], tuple[Array, float]]
-"""What a model adds to the position (3,), m, of a sensor of that name, and its variance, m^2."""
+PoseMap = Callable[[str, Array, Array], tuple[Array, float]]
+"""What a model adds to the position (3,), m, of a sensor of that name with a rotation (3, 3), and
+its variance a coordinate, m^2."""
 
 
 @dataclass(frozen=True)
@@ -146,6 +147,8 @@ class PoseEffect(BaseEffect[PoseTerm]):
     needs_levers = False
     """Whether it is seen only where the motion determines a lever arm: one that is not known,
     times turns that go with place or velocity, makes what looks like it."""
+    is_stiff = False
+    """Whether it is a map that follows hardly anything else, so that less of it is named."""
     makes_jitter = False
     """Whether poses that jitter more than before are explained by it."""
 
@@ -189,8 +192,8 @@ class PoseEffect(BaseEffect[PoseTerm]):
         """Return optical positions (n, 3) at the tracker's scale, m."""
         return position
 
-    def corrected(self, term: PoseTerm, sensor: str, position: Array) -> Array:
-        """Return tracked positions (n, 3), m, without what the effect does to them."""
+    def corrected(self, term: PoseTerm, sensor: str, position: Array, rotation: Array) -> Array:
+        """Return tracked positions (n, 3), m, with rotations (n, 3, 3), without the effect."""
         return position
 
     def seen_at(

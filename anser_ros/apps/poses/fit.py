@@ -84,11 +84,9 @@ class PoseFit(JointFit[PoseState]):
     def faked_levers(self) -> dict[str, Array]:
         """Return the variance (3,), m^2, of each sensor's lever arm that smooth errors make.
 
-        An error that goes with the turn (rad, of the body from its middle) by any matrix is alike
-        in nine ways. Three of them, of its odd part, are a lever arm; the scatter of the six
-        others, less what noise makes of it, is that of any: a twelfth for each, and six tell it to
-        3/2 (Student's t). A space that is stretched, which no map takes up, stretches the lever
-        arm too, and nothing of it stays.
+        Of the nine ways in which an error goes with the turn (rad, from the middle) three are a
+        lever arm; the scatter of the six others, less that of noise, is that of any: a twelfth for
+        each, and six tell it to 3/2 (Student's t). So does a stretch that no map takes up.
         """
         state, sensors = self.state, len(self.state.parts)
         columns: list[Array | None] = []
@@ -117,10 +115,8 @@ class PoseFit(JointFit[PoseState]):
     def noise_covariance(self) -> Array:
         """Return the covariance of all parameters, as `BlockSums.covariance`.
 
-        Errors of stamps are not independent where these lie on the grid of a poll: they are a
-        sawtooth, whose mean over many poses is far nearer to half a step than that of random
-        errors. What it adds to the poses' own noise is slow, and is seen in the slow course of the
-        blocks' scores (by sine tapers); the quick course is where teeth end in blocks.
+        Errors of stamps on the grid of a poll are a sawtooth. What it adds to the poses' own noise
+        is seen in the slow course of the blocks' scores (by sine tapers).
         """
         filtered = any(term.role is Role.FILTER for term in self.terms)
         sums = self.state.sums_with(filter_slopes=True) if filtered else self.sums
@@ -159,9 +155,9 @@ def fit_poses(problem: PoseProblem, terms: Sequence[PoseTerm], iterations: int =
 def strain_variance(fit: PoseFit) -> float:
     """Return the variance, 1e-6, of a scale by a smooth distortion of the size that is seen.
 
-    The tracker's space stretches in six ways, the scale is the mean of three of them. The scatter
-    of the five others, of a linear map in the scale's place, less what noise makes of it, is that
-    of any: a third of it is the mean's, and five tell it to 5/3 (Student's t).
+    Space stretches in six ways, of which a scale is one. The scatter of the five others, of a
+    linear map in its place, less that of noise, is that of any: a third of it is the mean's, and
+    five tell it to 5/3 (Student's t).
     """
     setting = fit.state.problem.setting
     linear = next(t for t in effect_with(Role.MAP).sites(setting) if t.theta.size == 9)
@@ -296,10 +292,8 @@ def is_lever_determined(
 ) -> Booleans:
     """Return the mask (3,) of the components of a lever arm that the motion determines.
 
-    Errors of the measured rotations make a lever arm too small by their share of the rotations'
-    variance, whatever its formal uncertainty: the reference's own jitter must be little of it. And
-    the lever arm that makes the median error by the turns of the body alone must be short; the
-    tracker's errors are taken to be ``error_m`` at least.
+    The reference's own jitter must be little of the rotations, by whose share it makes a lever arm
+    too small, and the lever arm that makes the median error, ``error_m`` at least, must be short.
     """
     if not part.used.any():
         return np.zeros(3, dtype=np.bool_)
@@ -340,9 +334,8 @@ def most_poses(session: PoseSession) -> PoseSequence:
 def knows_levers(fit: PoseFit, reference: PoseSequence) -> bool:
     """Return whether the motion determines two components of a sensor's lever arm.
 
-    So many are determined by turns about one axis. Where they are not, a body was carried about
-    with hardly a turn, or not moved at all. Much tilt determines them once the effects are found,
-    however large the error is that these make before.
+    So many are determined by turns about one axis. Much tilt determines them once the effects are
+    found, however large the error is that these make before.
     """
     shaking = turn_jitter(reference)
     for index, term in enumerate(fit.terms):

@@ -95,7 +95,7 @@ def read_form(path: Path, unit: str | None = None) -> Found:
     lines = [line for line in lines if not line.lstrip().startswith('#')]
     for first, line in enumerate(lines[:TITLE_LINES]):
         if re.match('Tools[\t,;]', line):
-            rows, read = _tool_tracker(lines[first:])
+            rows, read = _tool_tracker(lines[first:], path)
             break
         if 'Position:' in line:
             rows, read = _keyed(lines[first:], path)
@@ -114,7 +114,7 @@ def _number(text: str) -> float:
         return float('nan')
 
 
-def _tool_tracker(lines: Sequence[str]) -> Found:
+def _tool_tracker(lines: Sequence[str], path: Path) -> Found:
     """NDI ToolTracker: a group of columns a port; scalar first; states in words."""
     rows: dict[str, RawRows] = {}
     read, separator = 0, lines[0][len('Tools')]
@@ -123,7 +123,7 @@ def _tool_tracker(lines: Sequence[str]) -> Found:
         if cells[0] == 'Tools':  # once more where the program was started again
             read += 1
             continue
-        read += len(cells) >= PORT_COLUMNS
+        read, seen = read + (len(cells) >= PORT_COLUMNS), set()
         for start in range(1, len(cells), PORT_COLUMNS):
             port = cells[start : start + PORT_COLUMNS]
             if len(port) < PORT_COLUMNS - 1:
@@ -131,7 +131,11 @@ def _tool_tracker(lines: Sequence[str]) -> Found:
             label = re.sub(r'\W+', '_', port[0].split(':')[0].strip().lower())
             rate = POLARIS_HZ if 'OT' in port[0] else AURORA_HZ
             new = RawRows(form='wxyz', assumed_hz=0.0 if label else rate)
-            one = rows.setdefault(label or f'port_{1 + start // PORT_COLUMNS}', new)
+            label = label or f'port_{1 + start // PORT_COLUMNS}'
+            if label in seen:
+                raise ParameterError(f'{path}: two ports are called {label}: label them apart')
+            seen.add(label)
+            one = rows.setdefault(label, new)
             numbers = [_number(cell) for cell in port[4:11]]
             good = port[3].strip() in ('OK', 'Partially Out of Volume')
             pose = (*numbers[4:7], *numbers[:4]) if good else (float('nan'),) * 7

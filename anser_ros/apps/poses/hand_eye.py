@@ -128,8 +128,9 @@ def hand_eye_record(fit: PoseFit, index: int, jitter_rad: float) -> EffectRecord
     is_known = (sigma[:3] < LEAST_KNOWN_M) & is_lever_determined(part, jitter_rad)
     lever = [float(v) if known else None for v, known in zip(frames.lever, is_known, strict=True)]
     values: dict[str, object] = {
-        'sensor': name, 'lever_arm_m': lever, 'mount_rotation_deg': _degrees(frames.mount),
-        'registration_rotation_deg': None, 'registration_translation_m': None,
+        'sensor': name, 'lever_arm_m': lever, 'registration_rotation_deg': None,
+        'mount_rotation_deg': turn_of(frames.mount)[0].tolist(),
+        'registration_translation_m': None,
     }  # fmt: skip
     uncertainty: dict[str, object] = {
         'lever_arm_m': np.sqrt(sigma[:3] ** 2 + fit.faked_levers[name]).tolist(),
@@ -137,7 +138,7 @@ def hand_eye_record(fit: PoseFit, index: int, jitter_rad: float) -> EffectRecord
     }  # fmt: skip
     for base in (i for i, t in enumerate(fit.terms) if t.role is Role.REGISTRATION):
         apart = sigmas(fit.covariance_of(base))
-        values['registration_rotation_deg'] = _degrees(frames.rotation)
+        values['registration_rotation_deg'] = turn_of(frames.rotation)[0].tolist()
         values['registration_translation_m'] = frames.translation.tolist()
         uncertainty['registration_rotation_deg'] = np.rad2deg(apart[3:]).tolist()
         uncertainty['registration_translation_m'] = apart[:3].tolist()
@@ -145,10 +146,6 @@ def hand_eye_record(fit: PoseFit, index: int, jitter_rad: float) -> EffectRecord
     effect = effect_with(Role.MOUNT)
     evidence = {'summary': effect.summary, 'observable': known}
     return EffectRecord(effect.name, values, uncertainty, evidence)
-
-
-def _degrees(matrix: Array) -> list[float]:
-    return [float(v) for v in np.rad2deg(Rotation.from_matrix(matrix).as_rotvec())]
 
 
 BETWEEN_PAIRS_S = 10.0

@@ -101,7 +101,7 @@ def predicted(
     for term in terms:
         path = term.effect.filter(term, path) if term.acts_on(sensor.name) else path
         time = term.effect.clock(term, sensor.name, time)
-        position = term.effect.corrected(term, sensor.name, position)
+        position = term.effect.corrected(term, sensor.name, position, rotation)
     optical, turn, velocity, known = path.at(time)
     for term in terms:
         optical = term.effect.seen(term, optical)
@@ -209,11 +209,9 @@ class PoseState(JointState[PoseTerm, PosePart]):
     def sums_with(self, filter_slopes: bool = False, stamps_exact: bool = False) -> BlockSums:
         """Return normal equations by the slopes of filters, or as if the stamps were exact.
 
-        Time constants of filters, which have no slopes of their own, count by differences.
-        Positions alone tell times then: how a tracker takes means of orientations (of vectors,
-        quaternions or matrices) is not known, and moves a time constant by two standard
-        deviations. With ``stamps_exact`` the normal equations are the scores' variance if the
-        stamps have no errors after all, with the weights as they are.
+        Time constants of filters, which have no slopes of their own, count by differences, and
+        positions alone tell times then, as nobody knows how a tracker takes means of orientations.
+        With ``stamps_exact`` the normal equations are the scores' variance without such errors.
         """
         is_filtered = filter_slopes and any(term.role is Role.FILTER for term in self.terms)
         groups = []

@@ -39,10 +39,12 @@ poses by `LARGE_M`. Chosen on recordings with and without metal."""
 LARGE_M = 1.5e-3
 """Error, m, that no tracker has of itself: data sheets say 0.5 to 1.4 mm."""
 SCALE_SHARE, SCALE_M = 0.1, 0.8e-3
-"""The same of a scale of one sensor, which follows hardly anything: more below `SCALE_M`."""
+"""The same of what follows hardly anything, such as one sensor's scale: more below `SCALE_M`."""
 LEAST_MAP_M = 0.5e-3
 """Least that a map moves poses and takes off their errors, m rms: no tracker claims less."""
-
+LEAST_TOLD = 0.05
+"""Least share of an effect's square that frames do not make up for: 0.7 where orientation errors
+are, at most 0.03 where a body hardly turns, and they moved lever arms by 2 to 46 mm."""
 LEAST_OWN_SIGMAS = 5.0
 """Sigmas, of noise, by which a scale differs from one, or a sensor's clock from others: chance, 1
 in 250."""
@@ -82,8 +84,8 @@ def _map_share(term: PoseTerm, parts: Sequence[PosePart]) -> float:
     """
     squares = [p.noise.position_m**2 * np.sum(p.white[p.used, :3] ** 2, axis=1) for p in parts]
     error = float(np.mean(np.concatenate(squares)))
-    is_scale = term.effect.is_scale(term)
-    least, size = (SCALE_SHARE, SCALE_M) if is_scale else (LARGE_SHARE, LARGE_M)
+    is_stiff = term.effect.is_scale(term) or term.effect.is_stiff
+    least, size = (SCALE_SHARE, SCALE_M) if is_stiff else (LARGE_SHARE, LARGE_M)
     return float(np.clip(size**2 / max(error, 1e-18), least, MAP_SHARE))
 
 
@@ -97,6 +99,8 @@ def doubt(fit: PoseFit, index: int) -> str:
     seen = effect.seen_at(record, term, covariance, [part.view for part in fit.state.parts])
     if term.role is Role.MAP and float(seen.parameters['rms_m']) < LEAST_MAP_M:
         return f'moves poses by less than {1e3 * LEAST_MAP_M:g} mm'
+    if float(seen.parameters.get('told_share', 1.0)) < LEAST_TOLD:
+        return 'lever arms and the registration do nearly the same'
     noise = float(np.sqrt(fit.noise_covariance[fit.rows(index), fit.rows(index)][0, 0]))
     own_clock = effect.role.is_clock and term.sensor is not None
     if effect.role is Role.RATE and _is_beat(fit, term):
@@ -129,11 +133,12 @@ LAG_STEPS = (1.4, 1.4, 1.2, 1.1, 1.05)  # factors of a time constant by which it
 
 
 def with_lag(
-    fit: PoseFit, refused: list[tuple[str, str]]
+    fit: PoseFit, refused: list[tuple[str, str]], rival: PoseFit
 ) -> tuple[PoseFit | None, PoseFit | None]:
     """Return the fit with a low pass, where neither a delay nor a smooth reference does as well.
 
-    Also the best fit with a low pass or a smooth reference, whether it pays or not.
+    Also the best fit with a low pass or a smooth reference, whether it pays or not. One that
+    cannot do as well as a rival is not looked at closely.
     """
     if any(term.role is Role.FILTER for term in fit.terms):
         return None, None
@@ -146,7 +151,8 @@ def with_lag(
     trial = min(trials, key=lambda t: t.state.sum_of_squares)
     term, total = trial.terms[-1], fit.held_out()
     need = price(term, total, fit)
-    if fit.state.sum_of_squares - trial.state.sum_of_squares < HALF * need * fit.misfit:
+    gain = max(need * fit.misfit, fit.state.sum_of_squares - rival.state.sum_of_squares)
+    if fit.state.sum_of_squares - trial.state.sum_of_squares < HALF * gain:
         return None, trial if trial.held_out() < total else None
     trial = finest_lag(trial)
     term = trial.terms[-1]
@@ -269,11 +275,8 @@ def search_effects(
 ) -> PoseSearch:
     """Add effects one by one, the best first, while each pays for itself; drop what does not.
 
-    Where it is not wanted the frames alone are fitted, with the noise that they leave.
-
-    Where the motion determines no lever arm, turns that go with the place or the velocity, times a
-    lever arm of any length, look like any of them. Only the clocks are tried there. Raises
-    `DiagnosisError` when too few poses agree with the reference.
+    Where it is not wanted the frames alone are fitted, and only the clocks are tried where the
+    motion determines no lever arm. Raises `DiagnosisError` when too few poses agree.
     """
     fit = with_noise(start)
     agreeing = fit.state.count // 6
@@ -317,7 +320,7 @@ class _PoseSelection(ForwardSelection[PoseFit]):
         if not self._knows_levers or (best is not None and best.terms[-1].role.is_clock):
             return best
         # A filter rounds off turning points, which looks like a scale or a map.
-        lagging, filtered = with_lag(fit, self.refused)
+        lagging, filtered = with_lag(fit, self.refused, fit if best is None else best)
         if best is not None and filtered is not None and filtered.held_out() < best.held_out():
             term = best.terms[-1]
             both = fit_poses(fit.state.problem, [*filtered.terms, term])

@@ -148,9 +148,8 @@ def _pauses(sensors: Sequence[PoseSequence]) -> Array:
 def _recordings(
     reference: PoseSequence, sensors: Mapping[str, PoseSequence], starts: Array
 ) -> tuple[PoseTrack, dict[str, PoseSequence], float]:
-    """The reference's track, throughout each recording at rest; a few poses of these; their share.
-
-    Two programs that record one after the other share no time, and still the place.
+    """The reference's track, throughout each recording at rest; a few poses of these; their share:
+    two programs that record one after the other share no time, and still the place.
     """
     streams = [reference, *sensors.values()]
     common = _pauses(streams)
@@ -227,9 +226,8 @@ def coarse_clock(problem: PoseProblem) -> list[PoseTerm]:
 
 
 def _coarse_offset(problem: PoseProblem) -> float:
-    """The offset, s, at which tracked places are most nearly linear in the optical pose.
-
-    Where the motion is not alike then, it is that within the length of a recording at which it is.
+    """The offset, s, at which tracked places are most nearly linear in the optical pose, or if
+    motions are not alike then that, within a recording's length, at which they are.
     """
     chosen = [p.rows(slice(None, None, max(1, p.size // COARSE_POSES))) for p in problem.sensors]
     longest = longest_recording(problem)

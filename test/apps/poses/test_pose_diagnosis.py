@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses import diagnosis
 from anser_ros.apps.poses.cli.pose_session import pose_verdict
-from anser_ros.apps.poses.corrector import to_document
+from anser_ros.apps.poses.corrector import corrected, to_document, to_model
 from anser_ros.apps.poses.diagnosis import diagnose_poses, unconfirmed
 from anser_ros.apps.poses.effect import Role, effect_with
 from anser_ros.apps.poses.effects.field_distortion import FieldDistortion
@@ -81,6 +81,13 @@ def mirrored(streams):
     return streams
 
 
+def leaning(streams):
+    for name in ('sensor_0', 'sensor_1'):
+        axis = Rotation.from_quat(streams[name][2]).as_matrix()[:, :, 2]
+        streams[name][1] += 5e-3 * axis[:, [0]] * axis
+    return streams
+
+
 def swapped(streams):
     for one, other in zip(streams['sensor_0'], streams['sensor_1'], strict=True):
         one[300:], other[300:] = other[300:].copy(), one[300:].copy()
@@ -144,6 +151,25 @@ def test_one_thing_wrong_is_named_with_its_size(wrong, expected):
     assert set(found) == set(expected)
     for name, (key, value, tolerance) in expected.items():
         assert found[name].parameters[key] == pytest.approx(value, abs=tolerance)
+
+
+@pytest.mark.parametrize('share', [0.2, 1.0])
+def test_an_error_of_orientation_is_named_and_undone_if_it_is_no_lever_arm(share):
+    world = carried(World(2), share)  # with a fifth of the turns nothing tells them apart
+    world.after = leaning
+    found = diagnose_poses(world.session())
+    assert set(named(found)) == ({'orientation_error'} if share == 1.0 else set())
+    for record, lever in zip(hand_eyes(found), world.levers, strict=True):
+        for value, sigma, true in zip(
+            record.parameters['lever_arm_m'], record.uncertainty['lever_arm_m'], lever, strict=True
+        ):
+            assert value is None or abs(value - true) < 4 * sigma
+    if share == 1.0:
+        assert 'sensor' not in named(found)['orientation_error'].parameters
+        assert found.after.position_m < 0.6e-3 < found.before.position_m
+        session = corrected(world.session(), to_model(found))
+        again = diagnose_poses(session)
+        assert named(again) == {} and again.before.position_m < 0.6e-3
 
 
 def read_as(order, sign=1):

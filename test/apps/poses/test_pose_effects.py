@@ -12,8 +12,8 @@ from anser_ros.apps.poses.cli.pose_session import sizes
 from anser_ros.apps.poses.diagnosis import depends_on
 from anser_ros.apps.poses.effect import PoseSetting, Role, pose_effects
 from anser_ros.apps.poses.effects.episodes import LooseMount, PoseMovingMetal
-from anser_ros.apps.poses.effects.field_distortion import FieldDistortion
-from anser_ros.apps.poses.effects.frames import PoseClockRate
+from anser_ros.apps.poses.effects.field_distortion import FieldDistortion, OrientationError
+from anser_ros.apps.poses.effects.frames import PoseClockRate, PoseOpticalScale
 from anser_ros.apps.poses.effects.stream import ReceiptJitter, power_law, stamp_step, sudden_poses
 from anser_ros.apps.poses.fit import is_lever_determined
 from anser_ros.apps.poses.hand_eye import one_clock
@@ -141,11 +141,31 @@ def test_a_map_of_one_sensor_may_shift_it_and_one_of_all_may_not():
     own, every = effect.at(SETTING, 2, 'sensor_1'), effect.at(SETTING, 2, None)
     assert own.theta.size == every.theta.size + 3 == 30
     shift = own.with_theta(np.r_[1.0, -2.0, 3.0, np.zeros(27)])
-    np.testing.assert_allclose(effect.shift(shift, place), [[1e-3, -2e-3, 3e-3]] * 2)
+    moved = effect.corrected(shift, 'sensor_1', place, np.zeros((2, 3, 3))) - place
+    np.testing.assert_allclose(moved, [[1e-3, -2e-3, 3e-3]] * 2)
     record = effect.record(shift, np.eye(30))
     assert record.parameters['strain'] == 0.0  # a shift strains nothing
     again = effect.term(record)
     assert again.site == own.site and np.array_equal(again.theta, shift.theta)
+
+
+def test_an_orientation_error_is_an_even_function_of_the_axis_without_a_mean():
+    effect, turns = OrientationError(), Rotation.random(20000, random_state=1)
+    every, own, _ = effect.sites(SETTING)
+    term = every.with_theta(np.random.default_rng(2).normal(size=15))
+    place = np.zeros((20000, 3))
+    moved = effect.corrected(term, 'sensor_0', place, turns.as_matrix())
+    about = turns * Rotation.from_rotvec([0.0, 0.0, 0.7]) * Rotation.from_rotvec([np.pi, 0, 0])
+    np.testing.assert_allclose(
+        effect.corrected(term, 'sensor_0', place, about.as_matrix()), moved, atol=1e-12
+    )
+    assert np.linalg.norm(moved.mean(axis=0)) < 0.02 * np.sqrt(np.mean(moved**2))
+    again = effect.term(effect.record(term, np.eye(15)))
+    assert again.site == {} and np.array_equal(again.theta, term.theta)
+    bend = FieldDistortion().at(SETTING, 2, None)
+    assert effect.covers(term, own) and not effect.covers(own, term)
+    assert not effect.covers(term, bend) and not bend.effect.covers(bend, term)
+    assert not effect.covers(term, PoseOpticalScale().sites(SETTING)[0])
 
 
 @pytest.mark.parametrize(
@@ -252,7 +272,8 @@ def test_a_map_is_as_large_as_it_moves_the_poses_beside_a_rigid_motion():
     effect, rng = FieldDistortion(), np.random.default_rng(3)
     term = effect.at(SETTING, 1, None)
     place = np.column_stack([0.05 * rng.normal(size=(500, 2)), np.zeros(500)])
-    views = [SimpleNamespace(sensor='sensor_0', measured=place)]
+    turns = np.tile(np.eye(3), (500, 1, 1))
+    views = [SimpleNamespace(sensor='sensor_0', measured=place, measured_rotation=turns)]
     stretch = np.zeros((3, 3))
     stretch[0, 0], stretch[1, 0], stretch[0, 1] = 2.0, 1.0, -1.0  # and a turn, which is none
     stretch[2, 2] = 50.0  # along an axis that no pose is off

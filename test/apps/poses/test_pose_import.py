@@ -66,6 +66,12 @@ def test_tool_tracker_counts_field_periods_and_says_what_is_missing(tmp_path):
     assert 'port_1: no time; 320 frames a second are assumed' in session.lost
 
 
+def test_two_ports_of_one_label_are_refused_in_a_line(tmp_path):
+    path = tool_tracker(tmp_path / 'a.tsv', [(cell(8), cell(8))], ('Port 10: X', 'Port 10: Y'))
+    with pytest.raises(ParameterError, match=r'a\.tsv: two ports are called port_10'):
+        import_poses([path])
+
+
 def test_a_file_called_optical_alone_is_a_tracker(tmp_path):
     rows = [f'{t} 0 0 0 0 0 0 1' for t in range(1, 5)]
     session = import_poses([write(tmp_path / 'optical.tum', *rows)])

@@ -48,7 +48,7 @@ from anser_ros.wire.text_files import read_document
 UNUSED = ('refit', 'baseline', 'references', 'witnesses', 'in_phase', 'resurveyed', 'stated')
 """Options of other sessions."""
 UNSHOWN = ('centre_m', 'size_m', 'lowest', 'is_equal', 'middle_s', 'degree', 'strain', 'times_s',
-           'recordings')  # fmt: skip
+           'recordings', 'told_share')  # fmt: skip
 """Parameters that tell how a map or a course is written, and what has lines of its own."""
 SCALES = {'s': (1e3, 'ms'), 'm': (1e3, 'mm'), 'rad': (180 / math.pi, 'deg'), 'deg': (1.0, 'deg'),
           'ppm': (1.0, 'ppm')}  # fmt: skip

@@ -1,4 +1,4 @@
-"""The tracker's map of space is bent: a smooth function of the tracked place, for a sensor."""
+"""The tracker's map of space is bent: by the place or a sensor's direction."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,6 +31,9 @@ grows alike in all directions about a point of its own, which takes four numbers
 UNIT_M = 1e-3
 """Unit of theta, m: a coefficient is what it moves a pose at the rms distance from the middle."""
 
+EVEN_MEAN = np.array([1, 0, 0, 1, 0]) / 3
+"""Mean of the products xx, xy, xz, yy and yz of a direction's coordinates; zz is the others'."""
+
 
 def _smooth_map(record: EffectRecord) -> PositionMap:
     """The map of a record: what is added to tracked positions."""
@@ -62,12 +65,6 @@ def _lowest(site: PoseSite) -> int:
     would move the frames, and with them the lever arms of the others.
     """
     return int(site.get('lowest', 0 if 'sensor' in site else 1))
-
-
-def _count(site: PoseSite) -> int:
-    """The number of a map's monomials."""
-    basis = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, site['degree'], _lowest(site))
-    return int(basis.shape[1])
 
 
 def _without_turn(term: PoseTerm) -> Array:
@@ -128,35 +125,43 @@ class FieldDistortion(PoseEffect):
         }  # fmt: skip
         if degree == 0:
             return PoseTerm(self, site, np.zeros(4))
-        return PoseTerm(self, site, np.zeros(3 * _count(site)))
+        return PoseTerm(self, site, np.zeros(self._size(site)))
+
+    def _basis(self, site: PoseSite, position: Array, rotation: Array) -> Array:
+        """What each vector of theta is multiplied by for poses (n, 3), (n, 3, 3): (n, m)."""
+        centre = np.asarray(site['centre_m'])
+        return monomials(position, centre, site['size_m'], site['degree'], _lowest(site))
+
+    def _size(self, site: PoseSite) -> int:
+        """The number of parameters."""
+        return 3 * len(self._basis(site, np.zeros((1, 3)), np.zeros((1, 3, 3)))[0])
 
     def beside_scale(self, term: PoseTerm) -> PoseTerm:
         """Return a map of all sensors that stretches space by as much as it shrinks it."""
-        return term if term.sensor else replace(term, site={**term.site, 'is_equal': True})
+        is_whole = term.sensor is None and 'degree' in term.site
+        return replace(term, site={**term.site, 'is_equal': True}) if is_whole else term
 
     def is_scale(self, term: PoseTerm) -> bool:
-        return int(term.site['degree']) == 0
+        return term.site.get('degree') == 0
 
     def covers(self, term: PoseTerm, candidate: PoseTerm) -> bool:
         """Return whether the map contains what a scale, or a map of a lower degree, is."""
         own, site = term.site, candidate.site
-        is_part = candidate.role is Role.MAP
+        is_part = candidate.effect.name == self.name
         if not (is_part or (candidate.role is Role.SCALE and 'is_equal' not in own)):
             return False
         if term.sensor not in (None, candidate.sensor):
             return False
         has_lowest = own.get('lowest', 1) <= site.get('lowest', 1)
-        return bool(has_lowest and own['degree'] >= site.get('degree', 1))
+        return bool(has_lowest and own.get('degree', 0) >= site.get('degree', 0 if is_part else 1))
 
-    def _derivative(self, term: PoseTerm, position: Array) -> Array:
-        """What each parameter moves positions (n, 3) by, shape (n, 3, q), m."""
-        centre, size = np.asarray(term.site['centre_m']), term.site['size_m']
-        degree = term.site['degree']
-        if degree == 0:
-            away = ((position - centre) / size)[:, :, None]
+    def _derivative(self, term: PoseTerm, position: Array, rotation: Array) -> Array:
+        """What each parameter moves poses (n, 3), (n, 3, 3) by, shape (n, 3, q), m."""
+        if term.site.get('degree') == 0:
+            away = (position - np.asarray(term.site['centre_m']))[:, :, None] / term.site['size_m']
             shift = np.broadcast_to(np.eye(3), (len(position), 3, 3))
             return UNIT_M * np.concatenate([away, shift], axis=2)
-        basis = monomials(position, centre, size, degree, _lowest(term.site))
+        basis = self._basis(term.site, position, rotation)
         out = np.zeros((len(position), 3, term.theta.size))
         for axis in range(3):
             out[:, axis, axis::3] = UNIT_M * basis
@@ -169,59 +174,42 @@ class FieldDistortion(PoseEffect):
         if not term.acts_on(view.sensor):
             return None
         out = np.zeros((view.time.size, 6, term.theta.size))
-        out[:, :3] = -self._derivative(term, view.measured)
+        out[:, :3] = -self._derivative(term, view.measured, view.measured_rotation)
         return out
 
-    def shift(self, term: PoseTerm, position: Array) -> Array:
-        """Return what is added to tracked positions (n, 3), m."""
-        return self._derivative(term, position) @ term.theta
-
     def mapping(self, record: EffectRecord) -> PoseMap:
-        """Return what is added to a sensor's position (3,), m, and its variance a coordinate, m^2.
-
-        The parameters' standard deviations are taken as independent.
-        """
+        """Return what is added to positions, and its variance, by independent sigmas."""
         if record.parameters.get('kind') == SMOOTH:
             smooth = _smooth_map(record)
-            return lambda sensor, position: (smooth(position[None])[0], 0.0)
+            return lambda sensor, position, rotation: (smooth(position[None])[0], 0.0)
         term = self.term(record)
         sigmas_mm = np.asarray(record.uncertainty.get('coefficients_mm', 0.0), dtype=np.float64)
         variances = np.broadcast_to(sigmas_mm, term.theta.shape) ** 2
 
-        def added(sensor: str, position: Array) -> tuple[Array, float]:
+        def added(sensor: str, position: Array, rotation: Array) -> tuple[Array, float]:
             if not term.acts_on(sensor):
                 return np.zeros(3), 0.0
-            moved = self._derivative(term, position[None])[0]
+            moved = self._derivative(term, position[None], rotation[None])[0]
             return moved @ term.theta, float(np.mean(moved**2 @ variances))
 
         return added
 
-    def corrected(self, term: PoseTerm, sensor: str, position: Array) -> Array:
-        return position + self.shift(term, position) if term.acts_on(sensor) else position
+    def corrected(self, term: PoseTerm, sensor: str, position: Array, rotation: Array) -> Array:
+        if not term.acts_on(sensor):
+            return position
+        return position + self._derivative(term, position, rotation) @ term.theta
 
     def record(self, term: PoseTerm, covariance: Array) -> EffectRecord:
-        """Record the map, and how far it moves poses at their rms distance.
-
-        `seen_at` states how far it moves those of a session.
-        """
-        degree = term.site['degree']
-        bent = _without_turn(term) if degree else term.theta
-        # A scale's first number moves all three coordinates, as its shift does together.
-        rms = UNIT_M * float(np.linalg.norm(bent)) / (np.sqrt(3) if degree else 1.0)
-        # A shift strains nothing.
-        stretched = bent[3 * (_lowest(term.site) == 0) :] if degree else bent[:1]
-        strain = UNIT_M * float(np.linalg.norm(stretched)) / (np.sqrt(3) if degree else 1.0)
-        strain /= term.site['size_m']
-        spread = UNIT_M * float(np.sqrt(np.mean(sigmas(covariance) ** 2)))
-        return EffectRecord(
-            self.name,
-            {
-                **term.site, 'kind': KINDS[degree], 'rms_m': rms,
-                'strain': strain,
-                'coefficients_mm': term.theta.tolist(),
-            },
-            {'rms_m': spread, 'coefficients_mm': sigmas(covariance).tolist()},
-        )  # fmt: skip
+        """Record the map; `seen_at` states how far it moves the poses of a session."""
+        values: dict[str, object] = {**term.site, 'coefficients_mm': term.theta.tolist()}
+        if (degree := term.site.get('degree')) is not None:
+            # A shift strains nothing.
+            bent = (
+                _without_turn(term)[3 * (_lowest(term.site) == 0) :] if degree else term.theta[:1]
+            )
+            strain = UNIT_M * float(np.linalg.norm(bent)) / (np.sqrt(3) if degree else 1.0)
+            values |= {'kind': KINDS[degree], 'strain': strain / term.site['size_m']}
+        return EffectRecord(self.name, values, {'coefficients_mm': sigmas(covariance).tolist()})
 
     def seen_at(
         self, record: EffectRecord, term: PoseTerm, covariance: Array, views: Sequence[PoseView]
@@ -230,30 +218,34 @@ class FieldDistortion(PoseEffect):
 
         What it has of a rigid motion is a registration's, and moves nothing.
         """
-        place = np.concatenate([v.measured for v in views if term.acts_on(v.sensor)])
-        moved = self._derivative(term, place)
-        rigid = np.zeros((len(place), 3, 6))
-        rigid[:, :, :3] = np.eye(3)
-        away = (place - place.mean(axis=0)) / term.site['size_m']
-        for axis in range(3):
-            rigid[:, :, 3 + axis] = np.cross(np.eye(3)[axis], away)
-        basis, _ = np.linalg.qr(rigid.reshape(-1, 6))
+        own = [v for v in views if term.acts_on(v.sensor)]
+        place = np.concatenate([v.measured for v in own])
+        moved = self._derivative(term, place, np.concatenate([v.measured_rotation for v in own]))
+        rigid = self._rigid(own, place - place.mean(axis=0))
+        basis, _ = np.linalg.qr(rigid.reshape(3 * len(place), -1))
         bent = moved.reshape(-1, term.theta.size)
         bent = bent - basis @ (basis.T @ bent)
         size = bent @ term.theta
         rms = float(np.sqrt(size @ size / len(place)))
+        told = float(size @ size) / max(float(np.sum((moved @ term.theta) ** 2)), 1e-18)
         slope = (size @ bent) / (len(place) * max(rms, 1e-12))
         sigma = float(np.sqrt(slope @ covariance @ slope))
         values = {**record.parameters, 'rms_m': rms, **_apart(term, views)}
+        values |= {'told_share': told} if self.is_stiff else {}
         return replace(
             record, parameters=values, uncertainty={**record.uncertainty, 'rms_m': sigma}
         )
+
+    def _rigid(self, views: Sequence[PoseView], away: Array) -> Array:
+        """Columns (n, 3, q) of what is no bend, at places (n, 3) from their middle, m."""
+        turns = [np.cross(axis, away)[:, :, None] for axis in np.eye(3)]
+        return np.concatenate([np.tile(np.eye(3), (len(away), 1, 1)), *turns], axis=2)
 
     def term(self, record: EffectRecord) -> PoseTerm:
         keys = ('sensor', 'degree', 'lowest', 'is_equal', 'centre_m', 'size_m')
         site = cast(PoseSite, {k: record.parameters[k] for k in keys if k in record.parameters})
         theta = np.asarray(record.needed('coefficients_mm'), dtype=np.float64)
-        count = 3 * _count(site) if site['degree'] else 4
+        count = 4 if site.get('degree') == 0 else self._size(site)
         if theta.size != count:
             raise ModelFileError(
                 f'{self.name}: {theta.size} coefficients_mm, such a map has {count}'
@@ -261,4 +253,31 @@ class FieldDistortion(PoseEffect):
         return PoseTerm(self, site, theta)
 
 
-EFFECTS = (FieldDistortion(),)
+class OrientationError(FieldDistortion):
+    """Theta is a vector (mm) for each even function of second order of a sensor's z axis.
+
+    Odd functions are not distinguished from a lever arm, and a constant is the registration's.
+    """
+
+    name = 'orientation_error'
+    summary = "the tracker's positions err with the direction of a sensor's axis"
+    advice = 'Hold sensors in one direction to the field generator, or apply the correction.'
+    is_stiff = True
+
+    def sites(self, setting: PoseSetting) -> Sequence[PoseTerm]:
+        alone = [PoseSite(sensor=name) for name in setting.sensors if len(setting.sensors) > 1]
+        return [PoseTerm(self, site, np.zeros(self._size(site))) for site in (PoseSite(), *alone)]
+
+    def _basis(self, site: PoseSite, position: Array, rotation: Array) -> Array:
+        return monomials(rotation[:, :, 2], np.zeros(3), 1.0, 2, 2)[:, :5] - EVEN_MEAN
+
+    def _rigid(self, views: Sequence[PoseView], away: Array) -> Array:
+        """The same with the lever arm of each sensor."""
+        ends = np.cumsum([0, *(v.time.size for v in views)])
+        levers = np.zeros((len(away), 3, 3 * len(views)))
+        for k, view in enumerate(views):
+            levers[ends[k] : ends[k + 1], :, 3 * k : 3 * k + 3] = view.frame @ view.turn
+        return np.concatenate([super()._rigid(views, away), levers], axis=2)
+
+
+EFFECTS = (FieldDistortion(), OrientationError())

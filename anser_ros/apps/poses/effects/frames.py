@@ -90,10 +90,7 @@ class OpticalFrame(_Frame):
     def moved(
         self, before: effect.PoseTerm, after: effect.PoseTerm, middle: Array
     ) -> EffectRecord:
-        """Record the turn, and the shift where the poses are.
-
-        A turn about the far origin of a camera moves that by decimetres.
-        """
+        """Record the turn, and the shift where the poses are, not at a camera's far origin."""
         first, last = _frame(before), _frame(after)
         shift = last.rotation @ middle + last.translation
         shift -= first.rotation @ middle + first.translation
@@ -254,10 +251,8 @@ a delay, beyond a quarter nobody would work with the tracker."""
 
 
 class TrackerLag(effect.NumberEffect):
-    """Theta is the time constant, s, of a first-order low pass on position and rotation.
-
-    To first order a filter is a delay, so only its smoothing distinguishes it from one: it has no
-    slopes of its own, and is tried at several time constants beside a free time offset.
+    """Theta is the time constant, s, of a first-order low pass, without slopes of its own: it is
+    tried at several, beside a free time offset, as to first order it is a delay.
     """
 
     name = 'tracker_lag'

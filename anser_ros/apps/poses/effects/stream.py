@@ -251,8 +251,8 @@ def _stamp_error(residuals: PoseResiduals) -> tuple[float, float, float]:
 def _sigma(residuals: PoseResiduals) -> float:
     """Standard deviation of the median error of the stamps, s.
 
-    By Fisher's information about a variance: a pose has one degree of freedom along its velocity.
-    Sensors that differ by more have errors of their own; those that share stamps share the error.
+    By Fisher's information about a variance, of which a pose has one degree of freedom. Sensors
+    that differ by more have errors of their own; those that share stamps share the error.
     """
     sensors = residuals.sensors
     errors = np.array([s.noise.stamp_s for s in sensors])
