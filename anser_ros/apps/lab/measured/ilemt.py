@@ -52,14 +52,14 @@ SETS = {
 """Folder, places of the coils and band of each set, its fixtures, files to learn and to track."""
 ASKED = {
     'again': (), 'later': ('common_gain',), 'reversed': ('sensor_polarity',),
-    'crossed': ('coil_phase', 'coil_phase', 'coil_polarity'), 'moved': ('registration',),
-    'commanded': ('optical_scale',), 'fixture': ('body_turned',), 'gain': ('common_gain',),
+    'crossed': ('coil_phase', 'coil_phase', 'coil_polarity'),
+    'moved': ('registration', 'coil_turned', 'coil_moved'), 'commanded': ('optical_scale',),
+    'fixture': ('body_turned',), 'gain': ('common_gain',),
     'both': ('coil_polarity', 'sensor_polarity'), 'phases': ('coil_phase',) * 3,
     'step': ('coil_fluctuation',), 'shifted': ('registration',),
 }  # fmt: skip
-"""Effects that have to be named, and no others: in the last files of sets, where the dipole's
-source was moved or the concentric one's is not as in the other fixtures, and where the dipole's
-fine pattern is changed here."""
+"""Effects to name, and no others: in the last files of sets, where the dipole's source was moved
+and one emitter by itself, the concentric one's differs, and where the fine pattern is changed."""
 OTHERS = {'moved': ('dipole', 'cal_9_1_premo_rotated_dipole', MD),
           'shifted': ('concentric', 'cal_7_30_premo_cmu', LD)}  # fmt: skip
 """Set whose model tells what happened, folder and pattern, where these are not the dipole's."""
