@@ -50,8 +50,10 @@ def remember(stamp_ns, position, rotation, ratio, whitened, freedom, memory):  #
     moved = last[0] == 0 or distance(places[0], position) >= SUSPICIOUS_JUMP_M
     last[1] = 0 if moved else last[0]
     last[0] = stamp_ns
-    places[1], turns[1] = places[0], turns[0]
-    places[0], turns[0] = position, rotation
+    for i in range(3):  # assigned as arrays, they take 2 s more to be compiled
+        places[1, i], places[0, i] = places[0, i], position[i]
+        for j in range(3):
+            turns[1, i, j], turns[0, i, j] = turns[0, i, j], rotation[i, j]
 
 
 @inlined
@@ -83,14 +85,14 @@ def follow_body(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Solve a body where its last poses let expect it, judge it, remember it if it is sound.
 
-    ``flux`` (S, 2K), T; ``coils`` are `BodyCoils.arrays`,
-    of which those numbered ``used`` are solved with, and others left out unless it ``is_whole``:
-    then nothing is remembered. ``good`` are numbers of coils whose ``own`` positions (S, 3), axes
-    (S, 3) and normal matrices (S, 6, 6) tell where the body is, or none.
-    ``model`` is `SolveContext.arrays`, ``middle`` (3,), m, its middle, ``rules`` are
-    `coil_step.Rules`, ``limits`` what `usual_and_most` says. Returns whether the model's
-    covariance is finite; whether the pose is sound, and the volume holds no other place with such
-    fields; its covariance (6, 6); the rms of the residual, T; and the `BodySolution`.
+    ``flux`` (S, 2K), T; ``coils`` are `BodyCoils.arrays`, of which those numbered ``used`` are
+    solved with. Unless it ``is_whole``, others are left out, and nothing is remembered. ``good``
+    are numbers of coils whose ``own`` positions (S, 3), axes (S, 3) and normal matrices (S, 6, 6)
+    tell where the body is, or none. ``model`` is `SolveContext.arrays`, ``middle`` (3,), m, its
+    middle, ``rules`` are `coil_step.Rules`, ``limits`` what `usual_and_most` says. Returns whether
+    the model's covariance is finite; whether the pose is sound, and the volume holds no other
+    place with such fields; its covariance (6, 6); the rms of the residual, T; and the
+    `BodySolution`.
     """
     offsets, axes, lengths, changes = coils
     position, rotation = _expected(stamp_ns, memory)
