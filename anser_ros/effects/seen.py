@@ -15,89 +15,69 @@ from anser_ros.field.model import EffectRecord
 
 
 class Wiring(Effect[Term]):
-    """Has no parameter: its site, which is all lists of numbers, says what is wired how."""
+    """Has no parameter: its site, which is all lists of numbers, says what is wired how.
+
+    What ``read_as`` names takes the place of what the site names first; without it, the signs of
+    the latter are turned round.
+    """
 
     family = Family.SEEN
+    remedy = Remedy.FLUX
+
+    def __init__(self, name: str, summary: str, *keys: str) -> None:
+        self.name, self.summary = name, summary
+        self.units, self._of = dict.fromkeys(keys, '1'), keys[0]
 
     def term(self, record: EffectRecord) -> Term:
         return Term(self, self.site_of(record))
 
+    def matrix(self, term: Term, numbers: Integers) -> ComplexArray:
+        """Return what is read (rows) of what is there; as it is where a number is missing."""
+        shown = np.eye(numbers.size, dtype=complex)
+        named = term.recorded_site[self._of]
+        if 'read_as' not in term.site:
+            return shown * np.where(np.isin(numbers, named), -1.0, 1.0)
+        if np.isin(named, numbers).all():
+            row = {number: i for i, number in enumerate(numbers.tolist())}
+            there, true = ([row[n] for n in some] for some in (term.site['read_as'], named))
+            shown[there] = shown[true]
+        return shown
 
-def _exchanged(size: int, shown: Sequence[int], true: Sequence[int]) -> ComplexArray:
-    """Return the matrix that shows rows in the place of others, (size, size)."""
-    order = np.arange(size)
-    order[list(shown)] = true
-    return np.eye(size, dtype=complex)[order]
 
-
-class SwappedChannels(Wiring):
-    """Reads each of ``channels`` at the place of the one in ``read_as``."""
-
-    name = 'swapped_channels'
-    summary = 'sensors are plugged into each other'
-    units = {'channels': '1', 'read_as': '1'}
-    remedy = Remedy.FLUX
+class ChannelWiring(Wiring):
+    """Reads channels in each other's place, or the other way round."""
 
     def channel_matrix(self, term: Term, channels: Integers) -> ComplexArray:
-        """Return a permutation; channels of which one is missing stay as they are."""
-        row = {int(c): i for i, c in enumerate(channels)}
-        if not all(c in row for c in term.site['channels']):
-            return np.eye(channels.size, dtype=complex)
-        shown, true = ([row[c] for c in term.site[key]] for key in ('read_as', 'channels'))
-        return _exchanged(channels.size, shown, true)
+        return self.matrix(term, channels)
 
 
-class SwappedCoils(Wiring):
-    """Shows each emitter of ``coils`` in the place of the one in ``read_as``."""
-
-    name = 'swapped_coils'
-    summary = 'emitters are plugged into each other'
-    units = {'coils': '1', 'read_as': '1'}
-    remedy = Remedy.FLUX
+class CoilWiring(Wiring):
+    """Shows emitters in each other's place, or the other way round."""
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        return _exchanged(omega.size, term.site['read_as'], term.site['coils'])[None]
+        return self.matrix(term, np.arange(omega.size))[None]
 
 
 class DeadChannel(Wiring):
     """Silences channels whose readings are noise; they take no part in anything."""
 
-    name = 'dead_channel'
-    summary = 'a channel receives nothing'
-    units = {'channels': '1'}
+    remedy = Remedy.NONE
 
     def silenced(self, term: Term) -> tuple[int, ...]:
         return term.channels
 
 
-class SensorPolarity(Wiring):
-    """Turns the channels' signs round, without a parameter."""
-
-    name = 'sensor_polarity'
-    summary = 'a sensor is wired the other way round'
-    units = {'channels': '1'}
-    remedy = Remedy.FLUX
-
-    def channel_matrix(self, term: Term, channels: Integers) -> ComplexArray:
-        signs = np.where(np.isin(channels, term.site['channels']), -1.0, 1.0)
-        return np.diag(signs).astype(complex)
-
-
-class CoilPolarity(Wiring):
-    """Turns the emitters' signs round, without a parameter."""
-
-    name = 'coil_polarity'
-    summary = 'an emitter is wired the other way round'
-    units = {'coils': '1'}
-    remedy = Remedy.FLUX
-
-    def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        signs = np.where(np.isin(np.arange(omega.size), term.site['coils']), -1.0, 1.0)
-        return np.diag(signs).astype(complex)[None]
-
-
-SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL = SwappedChannels(), SwappedCoils(), DeadChannel()
-SENSOR_POLARITY, COIL_POLARITY = SensorPolarity(), CoilPolarity()
+SWAPPED_CHANNELS = ChannelWiring(
+    'swapped_channels', 'sensors are plugged into each other', 'channels', 'read_as'
+)
+SWAPPED_COILS = CoilWiring(
+    'swapped_coils', 'emitters are plugged into each other', 'coils', 'read_as'
+)
+DEAD_CHANNEL = DeadChannel('dead_channel', 'a channel receives nothing', 'channels')
+SENSOR_POLARITY = ChannelWiring(
+    'sensor_polarity', 'a sensor is wired the other way round', 'channels'
+)
+COIL_POLARITY = CoilWiring('coil_polarity', 'an emitter is wired the other way round', 'coils')
 
 
 @dataclass(frozen=True, kw_only=True)
