@@ -10,7 +10,6 @@ import math
 import numpy as np
 
 from anser_ros.kernel_cache import inlined, kernel
-from anser_ros.physics.constants import DIPOLE_CONSTANT
 
 FAST = {'reassoc', 'contract', 'nsz'}
 
@@ -240,20 +239,3 @@ def fill_without(  # type: ignore[no-untyped-def]
             if not is_walk:
                 for q in range(sets):
                     best[q] = max(best[q], log_evidence[h] + gain[h, q])
-
-
-@kernel
-def fill_dipole_tensors(points, sources, out):  # type: ignore[no-untyped-def]
-    """Write the field (3P rows, T) of unit moments along x, y and z (3M columns) of sources."""
-    for p in range(points.shape[0]):
-        for m in range(sources.shape[0]):
-            dx, dy = points[p, 0] - sources[m, 0], points[p, 1] - sources[m, 1]
-            dz = points[p, 2] - sources[m, 2]
-            inv2 = 1.0 / (dx * dx + dy * dy + dz * dz)
-            k3 = DIPOLE_CONSTANT * inv2 * math.sqrt(inv2)
-            k5 = 3.0 * k3 * inv2
-            i, j = 3 * p, 3 * m
-            out[i, j], out[i, j + 1], out[i, j + 2] = k5 * dx * dx - k3, k5 * dx * dy, k5 * dx * dz
-            out[i + 1, j], out[i + 1, j + 1] = k5 * dx * dy, k5 * dy * dy - k3
-            out[i + 1, j + 2], out[i + 2, j] = k5 * dy * dz, k5 * dx * dz
-            out[i + 2, j + 1], out[i + 2, j + 2] = k5 * dy * dz, k5 * dz * dz - k3

@@ -14,10 +14,9 @@ import numpy as np
 from scipy.linalg import cholesky
 
 from anser_ros.arrays import Array, Integers
-from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.dipole import field_basis
 from anser_ros.physics.sensor import along_each_axis
 from anser_ros.refit.clouds import Cloud, Excitation, Region
-from anser_ros.refit.kernels import fill_dipole_tensors
 
 BELOW, AROUND = 'below', 'around'
 RIDGE = 1e-5
@@ -68,22 +67,18 @@ class Layer:
             self._projected.clear()
             parts = np.array_split(sources, -(-len(sources) // AT_ONCE) or 1)
             self._projected[key] = np.hstack(
-                [self.inverse @ _field_rows(self.points, part) for part in parts]
+                [
+                    self.inverse @ component_rows(self.points, *along_each_axis(part))
+                    for part in parts
+                ]
             )
         return self._projected[key]
 
 
-def _field_rows(points: Array, sources: Array) -> Array:
-    """Return the field samples per unit moment component, shape (3P, 3M)."""
-    out = np.empty((3 * len(points), 3 * len(sources)))
-    fill_dipole_tensors(np.ascontiguousarray(points), np.ascontiguousarray(sources), out)
-    return out
-
-
 def component_rows(points: Array, positions: Array, directions: Array) -> Array:
     """Return the field samples per unit moment of dipoles (N, 3), shape (3P, N)."""
-    at, axes = along_each_axis(points)
-    return flux_basis(at, axes, None, positions, directions)
+    field = field_basis(points, positions, directions)
+    return field.swapaxes(1, 2).reshape(-1, len(positions))
 
 
 def _build(
