@@ -21,6 +21,16 @@ def complex_of(parts: Array) -> ComplexArray:
     return np.asarray(real + 1j * imaginary)
 
 
+def as_real(values: NDArray[np.inexact]) -> Array:
+    """Return complex values (..., K) as real ones (..., 2K), real and imaginary by turns."""
+    return np.ascontiguousarray(values, dtype=np.complex128).view(np.float64)
+
+
+def as_complex(values: Array) -> ComplexArray:
+    """Return real values (..., 2K), as `as_real` makes them, as complex ones (..., K)."""
+    return np.ascontiguousarray(values).view(np.complex128)
+
+
 def pairs_of(values: ComplexArray) -> Any:
     """Return complex numbers as a record has them, as lists of [re, im]."""
     return np.stack([values.real, values.imag], axis=-1).tolist()

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from anser_ros.arrays import as_real
 from anser_ros.calibration import joint_system
 from anser_ros.calibration.joint_system import JointSystem, open_directions, tied_parts
-from anser_ros.calibration.least_squares import STRIP, NormalFactor, as_real, subtract_gram
+from anser_ros.calibration.least_squares import STRIP, NormalFactor, subtract_gram
 from anser_ros.parallel import shared_among
 
 FRAMES, SENSORS, EMITTERS, MODES, PARAMETERS = 45, 3, 2, 5, 3

@@ -19,10 +19,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.arrays import Array, ComplexArray
+from anser_ros.arrays import Array, ComplexArray, as_real
 from anser_ros.calibration.courses import NONE, StrengthCourses, let_change
 from anser_ros.calibration.layouts import Generator, Layout, grid, moments_of_field, place
-from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import (
     SMALLEST_NOISE_T,
     PoseTerms,

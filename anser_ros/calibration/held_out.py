@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.arrays import Array, ComplexArray, Integers, as_complex
 from anser_ros.calibration import readings
 from anser_ros.calibration.layout_fit import LayoutFit
-from anser_ros.calibration.least_squares import as_complex
 from anser_ros.calibration.moments import (
     MomentFit,
     PoseTerms,

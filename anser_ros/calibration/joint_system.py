@@ -19,8 +19,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
-from anser_ros.calibration.least_squares import NormalFactor, as_complex, as_real, subtract_gram
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers, as_complex, as_real
+from anser_ros.calibration.least_squares import NormalFactor, subtract_gram
 from anser_ros.calibration.moments import PoseTerms, PoseWhitener, pose_slopes
 from anser_ros.calibration.readings import DipoleSites, basis_rows, flux_slopes, frame_blocks
 from anser_ros.calibration.sensor_parameters import SensorParameters, velocity_of

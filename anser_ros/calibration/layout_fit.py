@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from anser_ros.arrays import Array, ComplexArray
+from anser_ros.arrays import Array, ComplexArray, as_real
 from anser_ros.calibration.drawn_fit import drawn_where_read
 from anser_ros.calibration.layouts import (
     FREE_KINDS,
@@ -24,7 +24,6 @@ from anser_ros.calibration.layouts import (
     moments_of_field,
     place,
 )
-from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import MomentFit, MomentFitter, Progress
 from anser_ros.calibration.readings import DipoleSites, usable_readings, usable_weights, with_pose
 from anser_ros.field.measurements import Measurements

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from anser_ros.arrays import Array, ComplexArray
-from anser_ros.calibration.least_squares import GramFactor, as_complex, as_real
+from anser_ros.arrays import Array, ComplexArray, as_complex, as_real
+from anser_ros.calibration.least_squares import GramFactor
 from anser_ros.calibration.readings import DipoleSites, weighted_readings
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel

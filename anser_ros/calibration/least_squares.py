@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 
-from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.arrays import Array, Integers
 from anser_ros.parallel import in_order, slices
 
 RIGHT_SCALE = 1e9
@@ -112,16 +112,6 @@ class Spectrum:
     def freedom(self, damping: float) -> float:
         """Return the effective number of parameters, the trace of the influence matrix."""
         return float((self.values * self.filter(damping)).sum())
-
-
-def as_real(values: ComplexArray) -> Array:
-    """Return complex values (..., K) as real ones (..., 2K), real and imaginary by turns."""
-    return np.ascontiguousarray(values, dtype=np.complex128).view(np.float64)
-
-
-def as_complex(values: Array) -> ComplexArray:
-    """Return real values (..., 2K), as `as_real` makes them, as complex ones (..., K)."""
-    return np.ascontiguousarray(values).view(np.complex128)
 
 
 STRIP = 256

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.arrays import Array, ComplexArray
+from anser_ros.arrays import Array, ComplexArray, as_complex, as_real
 from anser_ros.calibration import least_squares, readings
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
@@ -57,9 +57,7 @@ def pose_terms(
     """Evaluate a model at the poses of measurements."""
     points, axes = measurements.placed()
     flux, by_place, by_axis = readings.flux_slopes(measurements, dipoles, moments)
-    residual = (least_squares.as_real(measurements.flux) - least_squares.as_real(flux)).astype(
-        np.float64
-    )
+    residual = (as_real(measurements.flux) - as_real(flux)).astype(np.float64)
     return PoseTerms(residual, pose_slopes(points, axes, measurements.position, by_place, by_axis))
 
 
@@ -72,7 +70,7 @@ def pose_slopes(
     (F, 3): the body's origin, m. ``by_place``, ``by_axis`` (F, S, 3, K): derivatives by the
     sensors' centres (T/m) and axes (T).
     """
-    place, turn = least_squares.as_real(by_place), least_squares.as_real(by_axis)
+    place, turn = as_real(by_place), as_real(by_axis)
     arms = points - position[:, None, :]
     out = np.empty((len(place), 6, place.shape[1], place.shape[3]))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -274,7 +272,7 @@ class MomentFitter:
         prior: ComplexArray | None = None,
     ) -> None:
         self.dipoles, self.damping, self.accuracy = dipoles, damping, accuracy
-        self.prior = None if prior is None else least_squares.as_real(prior)
+        self.prior = None if prior is None else as_real(prior)
         self.noise_t = self.quadrature_noise_t = accuracy.flux_noise_t
         self.states = [self._state(readings.with_pose(m)) for m in measurements]
         count = sum(int(state.usable.sum()) for state in self.states)
@@ -308,10 +306,10 @@ class MomentFitter:
             for block in readings.frame_blocks(count, sensors):
                 part = state.corrected.frames(block)
                 root = np.sqrt(state.weights[block].reshape(-1, 1))
-                right = least_squares.as_real(part.flux).reshape(-1, 2 * self.emitters)
+                right = as_real(part.flux).reshape(-1, 2 * self.emitters)
                 factor.add(root * readings.basis_rows(part, self.dipoles), root * right)
         moments, spectra = damped_moments(factor, self.dipoles, (self.damping,), self.prior)
-        return least_squares.as_complex(moments[0]), spectra
+        return as_complex(moments[0]), spectra
 
     def freedom(self, spectra: Sequence[least_squares.Spectrum]) -> float:
         """Return the effective number of parameters of an emitter."""

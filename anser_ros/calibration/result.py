@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.arrays import Array, ComplexArray
+from anser_ros.arrays import Array, ComplexArray, as_real
 from anser_ros.calibration.disturbances import spans_of
 from anser_ros.calibration.held_out import HeldOut, rms
 from anser_ros.calibration.layouts import Layout
-from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import FitFigures
 from anser_ros.calibration.population import FAR, OpticalNoise
 from anser_ros.calibration.readings import FEWEST_SCAN_FRAMES, usable_readings

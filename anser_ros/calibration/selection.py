@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.arrays import Array, ComplexArray, Integers, as_real
 from anser_ros.calibration.drawn_fit import is_of_coils
 from anser_ros.calibration.layout_fit import (
     LayoutPlacer,
@@ -26,7 +26,7 @@ from anser_ros.calibration.layout_fit import (
     rich_layout,
 )
 from anser_ros.calibration.layouts import FREE_KINDS, Generator, Layout, place
-from anser_ros.calibration.least_squares import GramFactor, as_real
+from anser_ros.calibration.least_squares import GramFactor
 from anser_ros.calibration.moments import (
     MomentFit,
     MomentFitter,

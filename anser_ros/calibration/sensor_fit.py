@@ -20,7 +20,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers, as_real
 from anser_ros.calibration.disturbances import glitches, outside, spans_of, unsteady_tool
 from anser_ros.calibration.joint_system import (
     LEAST_MOST_MODES,
@@ -43,7 +43,6 @@ from anser_ros.calibration.layout_fit import (
     richest,
 )
 from anser_ros.calibration.layouts import Generator, place
-from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import (
     SMALLEST_NOISE_T,
     MomentFitter,

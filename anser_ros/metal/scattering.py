@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.arrays import Array, ComplexArray, Integers, as_complex, as_real
 from anser_ros.field.model import Dipoles
 from anser_ros.kernel_cache import kernel
 from anser_ros.physics.constants import DIPOLE_CONSTANT, MU_0
@@ -100,7 +100,7 @@ class Shapes:
         made = np.moveaxis(made.reshape(*made.shape[:-1], shapes, count), -3, -2)
         made = made.reshape(*made.shape[:-3], shapes, -1) * (UNIT / MU_0)
         if np.iscomplexobj(made):
-            flux = (ears @ as_parts(made)).view(np.complex128)
+            flux = as_complex(ears @ as_real(made))
         else:
             flux = ears @ made
         return np.asarray(flux.reshape(*flux.shape[:-1], omega.size, count))
@@ -143,7 +143,7 @@ class Shapes:
         """Return the flux (..., S, K) of metal with these couplings."""
         made = np.swapaxes(self.answer(drive, couplings, omega), -1, -2)
         # Real and imaginary by turns: a product of real matrices takes half the time.
-        return np.asarray((ears @ as_parts(made)).view(np.complex128))
+        return as_complex(ears @ as_real(made))
 
     def sources(
         self, centre: Array, couplings: ComplexArray, illumination: Dipoles, omega: Array
@@ -152,11 +152,6 @@ class Shapes:
         points = centre + self.offsets
         made = self.answer(self.driven(illumination.field(points)), couplings, omega)
         return Dipoles.vectors(points, np.einsum('mni,km->nik', self.functionals, made))
-
-
-def as_parts(values: NDArray[np.inexact]) -> Array:
-    """Return complex values (..., K) as real ones (..., 2K), real and imaginary by turns."""
-    return np.ascontiguousarray(values, dtype=np.complex128).view(np.float64)
 
 
 def both_phases(unit: NDArray[np.inexact]) -> ComplexArray:

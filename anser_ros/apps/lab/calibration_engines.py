@@ -16,10 +16,9 @@ import numpy as np
 
 from anser_ros.apps.lab.one_place import calibrate_at_one_place
 from anser_ros.apps.lab.still import STILL_ONLY, calibrate_still
-from anser_ros.arrays import Array, ComplexArray, Integers
+from anser_ros.arrays import Array, ComplexArray, Integers, as_real
 from anser_ros.calibration import readings
 from anser_ros.calibration.calibrate import Options
-from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import PoseWhitener, Progress, pose_precision, pose_terms
 from anser_ros.calibration.result import Calibration, with_provenance
 from anser_ros.calibration.selection import COAXIAL, LEAST_GAIN

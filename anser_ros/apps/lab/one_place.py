@@ -15,10 +15,9 @@ import scipy.linalg
 
 from anser_ros.apps.lab.source_calibration import KINDS, SourceReadings, SourcesFit, SourcesFitter
 from anser_ros.apps.lab.still_fit import figures_of
-from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
+from anser_ros.arrays import Array, Booleans, ComplexArray, Integers, as_real
 from anser_ros.calibration.held_out import HeldOut, rms
 from anser_ros.calibration.layouts import Generator, Layout
-from anser_ros.calibration.least_squares import as_real
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.population import LEAST_EVIDENCE
 from anser_ros.calibration.readings import FOLDS, with_pose

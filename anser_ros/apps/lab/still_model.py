@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.arrays import Array, ComplexArray
-from anser_ros.calibration.least_squares import as_complex, as_real
+from anser_ros.arrays import Array, ComplexArray, as_complex, as_real
 from anser_ros.calibration.moments import pose_slopes
 from anser_ros.calibration.readings import DipoleSites
 from anser_ros.field.measurements import Measurements

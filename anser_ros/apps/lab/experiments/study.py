@@ -17,12 +17,12 @@ from anser_ros.apps.lab.experiments.recordings import (
 )
 from anser_ros.apps.lab.measured import anser_board
 from anser_ros.apps.lab.measured.recipe import shared_folder
-from anser_ros.arrays import Array
+from anser_ros.arrays import Array, as_complex, as_real
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.error_map import learn_error_map
 from anser_ros.calibration.layout_fit import emitter_gains
 from anser_ros.calibration.layouts import Layout, place
-from anser_ros.calibration.least_squares import TriangularFactor, as_complex, as_real
+from anser_ros.calibration.least_squares import TriangularFactor
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.readings import (
     DipoleSites,

@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from anser_ros.arrays import Array
+from anser_ros.arrays import Array, as_real
 from anser_ros.calibration import drawn_fit as drawn
 from anser_ros.calibration.layouts import Generator
-from anser_ros.calibration.least_squares import as_real
 from anser_ros.cli import output
 from anser_ros.cli.page import legend_under
 from anser_ros.errors import SetupError
