@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anser_ros.arrays import Array, ComplexArray, numbers_of
+from anser_ros.arrays import Array, ComplexArray, as_complex, as_real, numbers_of
 from anser_ros.errors import ModelFileError
 from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.physics.dipole import dipole_field, flux_basis
@@ -191,8 +191,7 @@ class ReferenceReadings:
 
 def readings_document(readings: ReferenceReadings) -> dict[str, Any]:
     """Return readings as plain lists and mappings, a row per sensor."""
-    parts = np.ascontiguousarray(readings.flux).view(np.float64)
-    rows = np.concatenate([readings.position, readings.axis, parts], axis=1)
+    rows = np.concatenate([readings.position, readings.axis, as_real(readings.flux)], axis=1)
     return {
         'sigma_t': readings.sigma_t,
         'sensors': [
@@ -207,17 +206,13 @@ def parse_readings(document: Any, emitters: int) -> ReferenceReadings:
     try:
         sensors = document['sensors']
         names = tuple(str(item['name']) for item in sensors)
-        rows = np.array([item['row'] for item in sensors], dtype=np.float64)
+        rows = _table([item['row'] for item in sensors], 6 + 2 * emitters, 'references')
         sigma = float(document['sigma_t'])
     except (KeyError, TypeError, ValueError) as error:
         raise ModelFileError(f'model: references are malformed: {error}') from error
-    if rows.shape != (len(names), 6 + 2 * emitters) or not names:
-        raise ModelFileError(
-            f'model: references must be rows of {6 + 2 * emitters} numbers, got {rows.shape}'
-        )
-    if not (np.isfinite(rows).all() and 0.0 <= sigma < np.inf):
+    if not 0.0 <= sigma < np.inf:
         raise ModelFileError('model: references hold values that are not finite')
-    flux = np.ascontiguousarray(rows[:, 6::2] + 1j * rows[:, 7::2])
+    flux = as_complex(rows[:, 6:])
     return ReferenceReadings(names, rows[:, :3].copy(), rows[:, 3:6].copy(), flux, sigma)
 
 
@@ -247,14 +242,7 @@ class ScanGaps:
 
 def parse_gaps(document: Any) -> ScanGaps:
     """Return gaps of a row per dipole: place, direction, R moments; raises `ModelFileError`."""
-    try:
-        table = np.array(document, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ModelFileError('model: gaps are no table of numbers') from error
-    if table.ndim != 2 or table.shape[1] < 7 or not np.isfinite(table).all():
-        raise ModelFileError(
-            f'model: gaps must be rows of at least 7 finite numbers, got {table.shape}'
-        )
+    table = _table(document, 7, 'gaps', is_least=True)
     return ScanGaps(table[:, :3].copy(), table[:, 3:6].copy(), table[:, 6:].T.copy())
 
 
@@ -431,8 +419,7 @@ class FieldModel:
 
 def to_document(model: FieldModel) -> dict[str, Any]:
     """Return the model as plain lists and mappings, ready to be written to a text file."""
-    parts = np.ascontiguousarray(model.moments, dtype=np.complex128).view(np.float64)
-    table = np.concatenate([model.positions, model.directions, parts], axis=1)
+    table = np.concatenate([model.positions, model.directions, as_real(model.moments)], axis=1)
     document: dict[str, Any] = {
         'schema': SCHEMA,
         'fingerprint': model.fingerprint,
@@ -467,18 +454,21 @@ def to_document(model: FieldModel) -> dict[str, Any]:
         columns = [model.gaps.positions, model.gaps.directions, model.gaps.moments.T]
         document['gaps'] = np.concatenate(columns, axis=1).tolist()
     if model.modes is not None:
-        modes = np.ascontiguousarray(model.modes, dtype=np.complex128)
-        document['modes'] = modes.view(np.float64).tolist()
+        document['modes'] = as_real(model.modes).tolist()
     return document
 
 
-def _table(value: Any, width: int, what: str) -> Array:
+def _table(value: Any, width: int, what: str, is_least: bool = False) -> Array:
+    """Rows of so many finite numbers, or of so many at least; raises `ModelFileError`."""
     try:
         table = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ModelFileError(f'model: {what} is not a table of numbers') from error
-    if table.ndim != 2 or table.shape[1] != width or table.shape[0] == 0:
-        raise ModelFileError(f'model: {what} must be rows of {width} numbers, got {table.shape}')
+    given = table.shape[1] if table.ndim == 2 and len(table) else 0
+    if given < width or (given > width and not is_least):
+        least = 'at least ' if is_least else ''
+        words = f'must be rows of {least}{width} numbers, got {table.shape}'
+        raise ModelFileError(f'model: {what} {words}')
     if not np.isfinite(table).all():
         raise ModelFileError(f'model: {what} holds values that are not finite')
     return table
@@ -538,7 +528,7 @@ def from_document(document: Any) -> FieldModel:
         parts = [_table(mode, 2 * k, 'modes') for mode in document['modes']]
         if any(part.shape[0] != table.shape[0] for part in parts):
             raise ModelFileError('model: every mode needs one row a dipole')
-        modes = np.array([part[:, 0::2] + 1j * part[:, 1::2] for part in parts])
+        modes = as_complex(np.array(parts))
     effects = document.get('effects') or []
     if not isinstance(effects, list):
         raise ModelFileError('model: effects must be a list')
@@ -549,7 +539,7 @@ def from_document(document: Any) -> FieldModel:
     model = FieldModel(
         positions=table[:, :3].copy(),
         directions=table[:, 3:6].copy(),
-        moments=np.ascontiguousarray(table[:, 6::2] + 1j * table[:, 7::2]),
+        moments=as_complex(table[:, 6:]),
         emitters=names,
         frequencies_hz=frequencies,
         flux_error_t=flux_error,
