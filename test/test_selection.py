@@ -13,14 +13,8 @@ from anser_ros.calibration.error_map import FEWEST_POINTS, IDENTITY, learn_error
 from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.layout_fit import LayoutPlacer, ScaledNominal
 from anser_ros.calibration.layouts import Generator, Layout, place
-from anser_ros.calibration.readings import FOLDS, fold_of_frames
-from anser_ros.calibration.selection import (
-    DAMPINGS,
-    LayoutCandidate,
-    LayoutScorer,
-    choose_layout,
-    thin_frames,
-)
+from anser_ros.calibration.readings import FOLDS, fold_of_frames, thinned
+from anser_ros.calibration.selection import DAMPINGS, LayoutCandidate, LayoutScorer, choose_layout
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
@@ -119,7 +113,7 @@ def test_the_drawn_board_is_expressed_by_any_layer(world):
 
 
 def test_the_choice_is_neither_too_coarse_nor_undamped(world):
-    thin = thin_frames([world.measurements])
+    thin = thinned([world.measurements], selection.MOST_ROWS)
     folds = fold_of_frames([m.position for m in thin])
     rich = place(Layout('layer', 10, 1.25, 0.0), world.generator)
     placer = LayoutPlacer(world.generator, thin)
@@ -132,9 +126,8 @@ def test_the_choice_is_neither_too_coarse_nor_undamped(world):
 
 
 @pytest.mark.long
-def test_selection_finds_a_prior_and_is_deterministic(world, monkeypatch):
-    monkeypatch.setattr(selection, 'MOST_ROWS', 300)
-    thin = thin_frames([world.measurements])
+def test_selection_finds_a_prior_and_is_deterministic(world):
+    thin = thinned([world.measurements], 300)
     folds = fold_of_frames([m.position for m in thin])
     generator = replace(world.generator, nominal=drawn(world, 0.9))
     runs = [choose_layout(thin, folds, generator, Accuracy()) for _ in range(2)]
@@ -143,9 +136,8 @@ def test_selection_finds_a_prior_and_is_deterministic(world, monkeypatch):
     assert len(runs[0].candidates) > 10
 
 
-def test_thinning_is_even_and_bounded(world, monkeypatch):
-    monkeypatch.setattr(selection, 'MOST_ROWS', 200)
-    thin = thin_frames([world.measurements, world.measurements])
+def test_thinning_is_even_and_bounded(world):
+    thin = thinned([world.measurements, world.measurements], 200)
     assert sum(m.flux.shape[0] * m.flux.shape[1] for m in thin) <= 212
     assert (np.diff(thin[0].time) == thin[0].time[1]).all()
 

@@ -29,10 +29,10 @@ from anser_ros.calibration.selection import (
     COUNTS,
     DAMPINGS,
     LOSS_FOR_A_THIRD,
+    MOST_ROWS,
     LayoutCandidate,
     Selection,
     choose_layout,
-    thin_frames,
 )
 from anser_ros.calibration.sensor_fit import SensorFit, SensorFitter
 from anser_ros.calibration.sensor_parameters import SURVEYED_M
@@ -110,7 +110,7 @@ def fit_scan(
     Raises `FitError` when one field cannot explain all sessions.
     """
     posed, accuracy, nominal = list(scan.measurements), scan.accuracy, generator.nominal
-    thin = thin_frames(posed)
+    thin = readings.thinned(posed, MOST_ROWS)
     folds = readings.fold_of_frames([m.position for m in thin])
     selection = choose_layout(thin, folds, generator, accuracy, progress, options.layout)
     chosen, held_out = _winner(selection, thin, folds, generator, accuracy)

@@ -37,6 +37,7 @@ from anser_ros.calibration.readings import (
     basis_rows,
     flux_slopes,
     fold_of_frames,
+    thinned,
     usable_weights,
 )
 from anser_ros.calibration.sensor_parameters import SensorParameters
@@ -576,15 +577,8 @@ def is_of_coils(nominal: FieldModel) -> bool:
 
 def drawn_where_read(measurements: Sequence[Measurements], generator: Generator) -> Dipoles:
     """Return the dipoles (N) of a drawing's coils where readings with a pose put them."""
-    some = evenly(measurements)
+    some = thinned(measurements, MOST_READINGS)
     return DrawnFitter(some, [True] * len(some), generator, (), 0.0, modes=0).coils()
-
-
-def evenly(measurements: Sequence[Measurements]) -> list[Measurements]:
-    """Return frames evenly over all, of about `MOST_READINGS` readings."""
-    readings = sum(m.flux.shape[0] * m.flux.shape[1] for m in measurements)
-    step = max(1, -(-readings // MOST_READINGS))
-    return [m.frames(slice(None, None, step)) for m in measurements]
 
 
 def _parts(measurements: Sequence[Measurements], typed: Sequence[bool]) -> Iterator[_Part]:

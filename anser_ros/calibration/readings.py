@@ -13,6 +13,7 @@ import numpy as np
 from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
+from anser_ros.parallel import slices
 from anser_ros.physics.dipole import flux_basis, flux_jacobian
 from anser_ros.physics.sensor import along_each_axis
 
@@ -33,8 +34,14 @@ class Readings(NamedTuple):
 
 def frame_blocks(count: int, sensors: int, rows: int = BLOCK_ROWS) -> list[slice]:
     """Return slices of whole frames with at most ``rows`` readings each, but at least a frame."""
-    step = max(1, rows // max(1, sensors))
-    return [slice(start, min(start + step, count)) for start in range(0, count, step)]
+    return slices(count, max(1, rows // max(1, sensors)))
+
+
+def thinned(measurements: Sequence[Measurements], most: int) -> list[Measurements]:
+    """Return every n-th frame with the smallest n that leaves about so many readings at most."""
+    count = sum(m.flux.shape[0] * m.flux.shape[1] for m in measurements)
+    step = slice(None, None, max(1, -(-count // most)))
+    return [m.frames(step) for m in measurements]
 
 
 def usable_readings(measurements: Sequence[Measurements]) -> Iterator[Readings]:

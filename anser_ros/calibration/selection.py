@@ -217,13 +217,6 @@ class Selection(NamedTuple):
     reference: MomentFit  # of the rich layer that corrected the poses
 
 
-def thin_frames(measurements: Sequence[Measurements]) -> list[Measurements]:
-    """Return every n-th frame with the smallest n that leaves about `MOST_ROWS` readings."""
-    rows = sum(m.flux.shape[0] * m.flux.shape[1] for m in measurements)
-    step = max(1, -(-rows // MOST_ROWS))
-    return [m.frames(np.arange(0, len(m.time), step)) for m in measurements]
-
-
 def choose_layout(
     measurements: Sequence[Measurements],
     folds: Sequence[Integers],

@@ -19,12 +19,12 @@ from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.disturbances import LEAST_DRIFT
 from anser_ros.calibration.drawn_fit import (
     LEVEL,
+    MOST_READINGS,
     PLACE,
     PLATE,
     SCALE,
     DrawnFit,
     DrawnFitter,
-    evenly,
 )
 from anser_ros.calibration.held_out import HeldOutTally
 from anser_ros.calibration.layout_fit import RICH
@@ -34,6 +34,7 @@ from anser_ros.calibration.population import OpticalNoise, Population
 from anser_ros.calibration.readings import (
     FEWEST_SCAN_FRAMES,
     is_thick,
+    thinned,
     usable_frames,
     usable_weights,
     with_pose,
@@ -119,7 +120,7 @@ def fit_to_drawing(
     _check_channels([tool for session in sessions for tool in session.tools])
     found, typed = [], []
     for whole in sessions:
-        session = replace(whole, tools=tuple(evenly(whole.tools)), reference=None)
+        session = replace(whole, tools=tuple(thinned(whole.tools, MOST_READINGS)), reference=None)
         starts = _drawn_poses(session, generator.nominal)
         for tool, start in zip(session.tools, starts, strict=True):
             typed.append(bool(tool.has_pose.any()))

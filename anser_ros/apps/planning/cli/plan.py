@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from anser_ros.arrays import Array, as_real
 from anser_ros.calibration import drawn_fit as drawn
 from anser_ros.calibration.layouts import Generator
+from anser_ros.calibration.readings import thinned
 from anser_ros.cli import output
 from anser_ros.cli.page import legend_under
 from anser_ros.errors import SetupError
@@ -142,7 +143,7 @@ def planned(effort: Effort, generator: Generator, noise_t: float) -> FieldModel:
     )  # fmt: skip
     is_typed = [effort.errors is not None]
     fitter = drawn.DrawnFitter(
-        drawn.evenly([read]), is_typed, generator, tuple(drawn.SENSORS), noise_t
+        thinned([read], drawn.MOST_READINGS), is_typed, generator, tuple(drawn.SENSORS), noise_t
     )
     if effort.errors is not None:
         fitter.jitter = effort.errors
