@@ -98,14 +98,6 @@ def rotation_of_vector(vector: AnyArray) -> Array:
     return np.asarray(np.eye(3) + a * cross + b * (cross @ cross))
 
 
-def rotation_between(first: Array, second: Array) -> Array:
-    """Return the rotation vector (3,), rad, in fg, that takes matrix ``first`` to ``second``."""
-    x, y, z, w = quaternion_of_rotation(second @ first.T)
-    sine = math.sqrt(x * x + y * y + z * z)  # of half the angle
-    factor = 2.0 * math.atan2(sine, w) / sine if sine > 0.0 else 2.0
-    return np.array([factor * x, factor * y, factor * z])
-
-
 def quaternion_of_axis(axis: AnyArray) -> tuple[float, float, float, float]:
     """Return the unit quaternion (x, y, z, w) of the shortest rotation of +z to a unit axis.
 
