@@ -40,6 +40,8 @@ KEYS = (
     'schema', 'fingerprint', 'frame_id', 'flux_rate_hz', 'flux_unit', 'emitter', 'sensors',
     'volume', 'tips', *SECTIONS,
 )  # fmt: skip
+CORNERS = ('low_m', 'high_m')
+"""Keys of the volume."""
 FIELD_GENERATOR = 'fg'
 
 
@@ -264,13 +266,8 @@ def _parse_sensor(item: Any, where: str) -> SensorSpec:
 
 
 def _parse_volume(item: Any) -> tuple[Vector, Vector]:
-    volume = read_mapping(item, 'volume')
-    unknown = sorted(set(volume) - {'low_m', 'high_m'})
-    if unknown:
-        raise SetupError(f'setup: volume has only the keys low_m and high_m, not {unknown[0]}')
-    low, high = (
-        read_vector(take(volume, key, 'volume'), f'volume.{key}') for key in ('low_m', 'high_m')
-    )
+    volume = read_mapping(item, 'volume', *CORNERS)
+    low, high = (read_vector(take(volume, key, 'volume'), f'volume.{key}') for key in CORNERS)
     if not all(a < b for a, b in zip(low, high, strict=True)):
         raise SetupError(f'setup: volume.low_m must be below volume.high_m, got {low} and {high}')
     return low, high
@@ -349,8 +346,7 @@ def dump_setup(setup: Setup) -> str:
     for sensor in sensors:
         if not sensor['windings']:
             del sensor['windings']
-    corners = zip(('low_m', 'high_m'), setup.volume or (), strict=False)
-    volume = {key: list(corner) for key, corner in corners}
+    volume = {key: list(c) for key, c in zip(CORNERS, setup.volume or (), strict=False)}
     document = {
         'schema': SCHEMA,
         'fingerprint': asdict(setup.identity),

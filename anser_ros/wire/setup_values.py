@@ -76,11 +76,16 @@ def read_windings(value: Any, where: str) -> tuple[Winding, ...]:
     return tuple(windings)
 
 
-def read_mapping(value: Any, where: str) -> dict[str, Any]:
-    """Return what has to be a mapping."""
+def read_mapping(value: Any, where: str, *keys: str) -> dict[str, Any]:
+    """Return what has to be a mapping; where keys are named, it may have no others."""
     if not isinstance(value, dict):
         got = 'nothing' if value is None else type(value).__name__
         raise SetupError(f'setup: {where} must be a mapping, got {got}')
+    unknown = sorted(set(map(str, value)) - set(keys))
+    if keys and unknown:
+        raise SetupError(
+            f'setup: {where} has only the keys {" and ".join(keys)}, not {unknown[0]}'
+        )
     return value
 
 
@@ -149,15 +154,8 @@ def parse_tips(item: Any) -> dict[str, TipSpec]:
     for body, value in read_mapping(item, KEY).items():
         where = f'{KEY}.{body}'
         read_name(body, f'a body of {KEY}')
-        tip = read_mapping(value, where)
-        unknown = sorted(set(map(str, tip)) - set(KEYS))
-        if unknown:
-            raise SetupError(
-                f'setup: {where} has only the keys {" and ".join(KEYS)}, not {unknown[0]}'
-            )
-        if 'position_m' not in tip:
-            raise SetupError(f'setup: {where} lacks position_m')
-        place = read_vector(tip['position_m'], f'{where}.position_m')
+        tip = read_mapping(value, where, *KEYS)
+        place = read_vector(take(tip, 'position_m', where), f'{where}.position_m')
         if max(map(abs, place)) > LONGEST_TIP_M:
             raise SetupError(f'setup: {where}.position_m is in m, got {list(place)}')
         numbers = tip.get('covariance_m2', [0.0] * 6)
