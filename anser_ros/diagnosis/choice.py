@@ -253,7 +253,7 @@ def moves_or_rests(
     if gain < decisions.NO_RIVAL * explained:
         return settled(fitter, moving.terms)
     shaped, rest = in_order(lambda fit: settled(fitter, fit.terms), [moving, rest])
-    limit = _limit(fitter, shaped, explained)
+    limit = _limit(shaped, explained)
     if rest.held_out() < limit:
         return rest
     scorer = Scorer(rest.state, fitter.blocks)
@@ -274,12 +274,12 @@ def moves_or_rests(
                 continue
             # What is there besides helps metal that moves as much: like is compared with like.
             beside = fitter.fit([*shaped.terms, start])
-            if both.held_out() < _limit(fitter, beside, explained):
+            if both.held_out() < _limit(beside, explained):
                 return rest
     return shaped
 
 
-def _limit(fitter: Fitter, moving: Fit, explained: float) -> float:
+def _limit(moving: Fit, explained: float) -> float:
     """Held-out sum of squares up to which metal at rest explains as much."""
     more = decisions.ALIKE * explained + decisions.LEAST_MOTION_GAIN * max(moving.misfit, 1.0)
     return moving.held_out() + more
