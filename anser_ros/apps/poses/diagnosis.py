@@ -37,8 +37,8 @@ from anser_ros.apps.poses.search import (
     LEAST_MAP_M,
     PoseSearch,
     frame_terms,
+    judged,
     search_effects,
-    weights_of,
     with_noise,
 )
 from anser_ros.apps.poses.sequence import REFERENCE, PoseSession
@@ -57,13 +57,6 @@ class HeldOutErrors:
     position_m: float
     orientation_rad: float
     by_sensor: dict[str, tuple[float, float]]
-
-
-def judged(problem: PoseProblem, fit: PoseFit) -> PoseProblem:
-    """Return a problem with the noise of a fit, and without the poses that stand out from it."""
-    every = tuple(np.ones(s.size) for s in problem.sensors)
-    noisy = replace(problem, weight=every, noise=fit.state.problem.noise)
-    return replace(noisy, weight=weights_of(noisy.state(fit.terms)))
 
 
 def errors_of(state: PoseState) -> HeldOutErrors:
@@ -332,12 +325,11 @@ def _on_all(
     session: PoseSession, problem: PoseProblem, found: PoseFit, has_episodes: bool
 ) -> PoseFit:
     """What was found, fitted to all poses; outside episodes if these tell the lever arms."""
-    whole = with_time_constants(fit_poses(judged(problem, found), found.terms))
+    known = judged(problem, found)
+    whole = with_time_constants(fit_poses(known, found.terms))
     if not has_episodes:
         return whole
-    outside = _outside(
-        judged(problem, found).state(found.terms), _residuals(session, problem, whole)
-    )
+    outside = _outside(known.state(found.terms), _residuals(session, problem, whole))
     quiet = with_time_constants(fit_poses(outside.problem, found.terms))
     return quiet if knows_levers(quiet, most_poses(session)) else whole
 

@@ -218,8 +218,8 @@ class PoseEffect(BaseEffect[PoseTerm]):
         """Return the map of a record, which a corrector applies; None for other effects."""
         return None
 
-    def beside_scale(self, term: PoseTerm) -> PoseTerm:
-        """Return what is left of a term beside one scale of all sensors."""
+    def beside_scale(self, term: PoseTerm, is_scaled: bool = True) -> PoseTerm:
+        """Return what is left of a term beside one scale of all sensors, or without that."""
         return term
 
     def is_scale(self, term: PoseTerm) -> bool:

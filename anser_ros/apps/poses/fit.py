@@ -155,18 +155,21 @@ def fit_poses(problem: PoseProblem, terms: Sequence[PoseTerm], iterations: int =
 def strain_variance(fit: PoseFit) -> float:
     """Return the variance, 1e-6, of a scale by a smooth distortion of the size that is seen.
 
-    Space stretches in six ways, of which a scale is one. The scatter of the five others, of a
-    linear map in its place, less that of noise, is that of any: a third of it is the mean's, and
-    five tell it to 5/3 (Student's t).
+    Space stretches in six ways, of which a scale is one. The scatter of the five others, of the
+    map that stands beside it or of a linear one in its place, less that of noise, is that of any:
+    a third of it is the mean's, and five tell it to 5/3 (Student's t).
     """
     setting = fit.state.problem.setting
-    linear = next(t for t in effect_with(Role.MAP).sites(setting) if t.theta.size == 9)
-    terms = [linear, *(t for t in fit.terms if t.sensor or t.role not in (Role.SCALE, Role.MAP))]
-    trial = fit_poses(fit.state.problem, terms, 3)
+    index = next((i for i, term in enumerate(fit.terms) if 'is_equal' in term.site), 0)
+    if 'is_equal' not in fit.terms[index].site:
+        linear = next(t for t in effect_with(Role.MAP).sites(setting) if t.theta.size == 9)
+        rest = (t for t in fit.terms if t.sensor or t.role not in (Role.SCALE, Role.MAP))
+        fit, index = fit_poses(fit.state.problem, [linear, *rest], 3), 0
+    own = fit.rows(index).start + np.arange(9)
     other = np.eye(9) + np.eye(9).reshape(3, 3, 9).swapaxes(0, 1).reshape(9, 9)
     unequal = other / 2 - np.outer(np.eye(3), np.eye(3)).reshape(9, 9) / 3
-    strains = unequal @ trial.terms[0].theta / setting.size
-    noise = np.trace(unequal @ trial.covariance_of(0) @ unequal) / setting.size**2
+    strains = unequal @ fit.terms[index].theta[:9] / setting.size
+    noise = np.trace(unequal @ fit.noise_covariance[np.ix_(own, own)] @ unequal) / setting.size**2
     seen = float(strains @ strains)
     return (seen - float(noise)) / 9 if seen > STRAINED * noise else 0.0
 
@@ -223,8 +226,8 @@ def _spread(part: PosePart) -> PoseNoise:
     )
 
 
-def unexplained_poses(state: PoseState) -> tuple[Booleans, ...]:
-    """Return the poses that nothing explains: far beyond the spread of their sensor's others."""
+def weights_of(state: PoseState) -> tuple[Array, ...]:
+    """Return weights, zero of poses far beyond the spread of their sensor's others."""
     found = []
     for part in state.parts:
         noise = replace(_spread(part), stamp_s=part.noise.stamp_s)
@@ -232,7 +235,7 @@ def unexplained_poses(state: PoseState) -> tuple[Booleans, ...]:
         far = np.maximum(*(np.linalg.norm(half, axis=1) for half in np.hsplit(white, 2)))
         out = part.used & (far > STANDS_OUT)
         few = np.count_nonzero(out) <= FEW_SHARE * np.count_nonzero(part.used)
-        found.append(out if few else part.used & (far > FAR_OUT))
+        found.append(np.where(out if few else part.used & (far > FAR_OUT), 0.0, 1.0))
     return tuple(found)
 
 

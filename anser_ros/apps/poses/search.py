@@ -20,13 +20,12 @@ from anser_ros.apps.poses.fit import (
     knows_levers,
     most_poses,
     noise_of,
-    unexplained_poses,
+    weights_of,
     with_time_constants,
 )
-from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseState, stamp_step
+from anser_ros.apps.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState, stamp_step
 from anser_ros.apps.poses.sequence import PoseSession
 from anser_ros.apps.poses.start import FEWEST_HAND_EYE_POSES
-from anser_ros.arrays import Array
 from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN, PER_PARAMETER
 from anser_ros.diagnosis.engine import ForwardSelection, Scorer, is_covered
 from anser_ros.errors import DiagnosisError
@@ -66,15 +65,13 @@ def gain_of(before: PoseFit, after: PoseFit, term: PoseTerm) -> float:
 
 def price(term: PoseTerm, total: float, fit: PoseFit) -> float:
     """Return the gain, in units of the misfit, that a term needs; ``total`` is the squared sum."""
-    misfit, share = fit.misfit, LEAST_EXPLAINED
     # Only the errors of its own sensor, and of positions where it is a map, can be explained.
     rows = slice(3) if term.role is Role.MAP else slice(6)
     parts = [p for p in fit.state.parts if term.acts_on(p.view.sensor)]
     own = float(sum(np.sum(p.white[:, rows] ** 2) for p in parts))
-    if term.role is Role.MAP:
-        share = _map_share(term, parts)
+    share = _map_share(term, parts) if term.role is Role.MAP else LEAST_EXPLAINED
     total *= own / max(fit.state.sum_of_squares, 1e-300)
-    return max(LEAST_GAIN + PER_PARAMETER * max(term.complexity, 1), share * total / misfit)
+    return max(LEAST_GAIN + PER_PARAMETER * max(term.complexity, 1), share * total / fit.misfit)
 
 
 def _map_share(term: PoseTerm, parts: Sequence[PosePart]) -> float:
@@ -246,20 +243,21 @@ def with_noise(fit: PoseFit, with_stamps: bool = True) -> PoseFit:
 
     Errors of the stamps are part of the noise where they are believed, if ``with_stamps``.
     """
-    problem, state = fit.state.problem, fit.state
+    problem = replace(fit.state.problem, weight=weights_of(fit.state))
     for _ in range(NOISE_ROUNDS):
-        cut = replace(problem, weight=weights_of(state))
-        parts = cut.state(fit.terms).parts
+        parts = problem.state(fit.terms).parts
         noise = tuple(likely_noise(p) if with_stamps else noise_of(p, False)[0] for p in parts)
-        every = tuple(np.ones(weight.size) for weight in cut.weight)
-        problem = replace(problem, weight=every, noise=noise)
-        state = problem.state(fit.terms)
-    return fit_poses(replace(problem, weight=weights_of(state)), fit.terms)
+        problem = judged(problem, fit, noise)
+    return fit_poses(problem, fit.terms)
 
 
-def weights_of(state: PoseState) -> tuple[Array, ...]:
-    """Return weights of the poses of a state, zero of those that stand out."""
-    return tuple(np.where(mask, 0.0, 1.0) for mask in unexplained_poses(state))
+def judged(
+    problem: PoseProblem, fit: PoseFit, noise: tuple[PoseNoise, ...] | None = None
+) -> PoseProblem:
+    """Return a problem with a noise, a fit's by default, less poses that stand out from it."""
+    every = tuple(np.ones(s.size) for s in problem.sensors)
+    noisy = replace(problem, weight=every, noise=noise or fit.state.problem.noise)
+    return replace(noisy, weight=weights_of(noisy.state(fit.terms)))
 
 
 def likely_noise(part: PosePart) -> PoseNoise:
@@ -359,6 +357,9 @@ class _PoseSelection(ForwardSelection[PoseFit]):
         if weakest is None:
             return None
         share, term, without = weakest
+        if term.role is Role.SCALE:
+            whole = [t.effect.beside_scale(t, False) for t in without.terms]
+            without = fit_poses(fit.state.problem, whole)
         self.refused.append((term.label, f'{share:.2f} of the gain that it must have'))
         return with_noise(without, self._knows_levers)
 

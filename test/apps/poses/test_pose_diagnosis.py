@@ -369,6 +369,10 @@ def test_a_scale_comes_first_and_then_what_a_distortion_adds_to_it():
     assert abs(scale['scale'] - 1.012) < 3 * sigma['scale'] < 0.012
     bend = found['field_distortion'].parameters
     assert bend['is_equal'] and 5e-4 < bend['rms_m'] < 3e-3
+    # What the map strains unevenly is what a distortion fakes of the scale: a ninth, squared.
+    strain = np.reshape(bend['coefficients_mm'][:9], (3, 3)) * 1e-3 / bend['size_m']
+    strain = (strain + strain.T) / 2 - np.trace(strain) / 3 * np.eye(3)
+    assert sigma['scale'] == pytest.approx(np.linalg.norm(strain) / 3, rel=0.05)
 
 
 def test_what_two_sensors_of_three_have_is_theirs_and_says_where_they_are():

@@ -136,10 +136,13 @@ class FieldDistortion(PoseEffect):
         """The number of parameters."""
         return 3 * len(self._basis(site, np.zeros((1, 3)), np.zeros((1, 3, 3)))[0])
 
-    def beside_scale(self, term: PoseTerm) -> PoseTerm:
-        """Return a map of all sensors that stretches space by as much as it shrinks it."""
+    def beside_scale(self, term: PoseTerm, is_scaled: bool = True) -> PoseTerm:
+        """Return a map of all sensors, beside a scale less the mean of its strains."""
+        site: PoseSite = {**term.site, 'is_equal': True}
+        if not is_scaled:
+            del site['is_equal']
         is_whole = term.sensor is None and 'degree' in term.site
-        return replace(term, site={**term.site, 'is_equal': True}) if is_whole else term
+        return replace(term, site=site) if is_whole else term
 
     def is_scale(self, term: PoseTerm) -> bool:
         return term.site.get('degree') == 0
