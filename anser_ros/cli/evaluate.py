@@ -310,9 +310,10 @@ def why_withheld(model: FieldModel, evaluation: Evaluation) -> tuple[str, ...]:
     found = Counter(pose.state for pose in poses)
     worst, count = max(found.items(), key=lambda one: (one[0] != OK, one[1]), default=(OK, 0))
     is_other = worst == RESIDUAL and known and 2 * count > len(poses)
-    of_bodies = any(body.ok.mean() > HARDLY for body in evaluation.bodies.values())
-    if worst == OK or ((of_bodies or found[OK] > HARDLY * len(poses)) and not is_other):
+    if worst == OK or (found[OK] > HARDLY * len(poses) and not is_other):
         return ()
+    of_bodies = any(body.ok.mean() > HARDLY for body in evaluation.bodies.values())
+    whose = 'most poses of single coils are' if of_bodies else 'most poses are'
     reasons = [pose.reason for pose in poses if pose.state == worst and pose.reason]
     such = f' ({reasons[len(reasons) // 2]})' if reasons else ''
     listed = f'the coils of its calibration (channels {", ".join(map(str, known))})'
@@ -322,7 +323,7 @@ def why_withheld(model: FieldModel, evaluation: Evaluation) -> tuple[str, ...]:
         'look for metal'
     )
     return (
-        f'most poses are withheld, state {worst} in {count} of {len(poses)}{such}'
+        f'{whose} withheld, state {worst} in {count} of {len(poses)}{such}'
         f'{why if worst == RESIDUAL else ""}',
     )
 
