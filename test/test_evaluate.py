@@ -156,6 +156,9 @@ def test_what_all_poses_and_the_reference_have_between_them_is_said(moving):
     words = said(place[::-1], turn[::-1])
     assert 'no frame, mounting, unit or order of axes explains that' in words
     assert said(np.full_like(place, np.nan), turn) == ''
+    third = place.copy()
+    third[: len(place) // 3] += [0.05, 0.0, 0.0]
+    assert f'{len(place) // 3} of {len(place)} by more than 5.00 mm' in said(third, turn)
 
 
 def test_parts_of_several_mountings_are_tracked_one_after_the_other(model, moving, monkeypatch):

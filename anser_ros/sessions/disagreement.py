@@ -25,6 +25,9 @@ EXPLAINED = 0.5
 """Share of the error that may be left by what explains it: four fifths of its power are gone."""
 GROSS_M, GROSS_RAD = 5e-3, np.radians(5.0)
 """Median errors that no tracker of this kind has: something was stated wrongly."""
+LARGE_PART = 0.1
+"""Share of poses grossly off from which on a part of the recording stands otherwise: fewer are
+reflections of an optical tracker's markers."""
 ARM_M = 0.1
 """Distance, m, at which a turn is compared with a shift: the size of a hand, or a tool."""
 
@@ -52,18 +55,23 @@ def disagreement(
     apart = _apart(given, true)
     size, limit = _size(apart), np.maximum(2.0 * APART * sigma, [GROSS_M, GROSS_RAD])
     is_gross = bool((np.median(apart, axis=0) > limit).any())
+    count = int((apart > limit).any(axis=1).sum())
+    off = f'{name}: the reference is {_words(*size)} rms off the poses'
+    if not is_gross and count > LARGE_PART * len(apart):
+        part = f'{count} of {len(apart)} by more than {_words(*limit)}'
+        return (f'{off}, {part}: part of the recording was stated otherwise, or moved',)
     found = [*_frames(given, true)]
     found += [(r.placed(*true), f'read as {r.words}') for r in OTHER_READINGS if is_gross]
     each = [(_size(_apart(given, other)), words) for other, words in found]
     left, words = min(each, key=lambda one: one[0] @ [1.0, ARM_M])
     is_less = is_gross or ((left < EXPLAINED * size) & (size > APART * sigma)).any()
     if is_less and (left < limit).all():
-        words = f'{words}, {_words(*left)}'
+        words = f'{words}, {_words(*left)} are left'
     elif is_gross:
         words = 'no frame, mounting, unit or order of axes explains that'
     else:
         return ()
-    return (f'{name}: the reference is {_words(*size)} rms off the poses; {words}',)
+    return (f'{off}; {words}',)
 
 
 def _frames(given: Poses, true: Poses) -> Iterator[tuple[Poses, str]]:

@@ -165,7 +165,8 @@ def check_made_for(model: FieldModel, setup: Setup, where: str) -> None:
         if known is not None and known != now.bodies[body]:
             raise ModelFileError(
                 f'effects of the model {model.fingerprint} are of the sensors {known} on {body}; '
-                f'{where} has {now.bodies[body]} there'
+                f'{where} has {now.bodies[body]} there, with other places, axes or channels: '
+                f'calibrate with these, or state what holds (--resurveyed {body} in a command)'
             )
 
 

@@ -127,6 +127,11 @@ class PoseTerm(BaseTerm):
         return None if name is None else str(name)
 
     @property
+    def is_beside_scale(self) -> bool:
+        """Return whether it is a map beside a scale, which has what is alike along all axes."""
+        return 'is_equal' in self.site
+
+    @property
     def middle_s(self) -> float:
         """Return the time at which a clock's offset is its offset, s."""
         return float(self.site.get('middle_s', 0.0))

@@ -160,8 +160,8 @@ def strain_variance(fit: PoseFit) -> float:
     a third of it is the mean's, and five tell it to 5/3 (Student's t).
     """
     setting = fit.state.problem.setting
-    index = next((i for i, term in enumerate(fit.terms) if 'is_equal' in term.site), 0)
-    if 'is_equal' not in fit.terms[index].site:
+    index = next((i for i, term in enumerate(fit.terms) if term.is_beside_scale), 0)
+    if not fit.terms[index].is_beside_scale:
         linear = next(t for t in effect_with(Role.MAP).sites(setting) if t.theta.size == 9)
         rest = (t for t in fit.terms if t.sensor or t.role not in (Role.SCALE, Role.MAP))
         fit, index = fit_poses(fit.state.problem, [linear, *rest], 3), 0

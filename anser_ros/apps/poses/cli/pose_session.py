@@ -479,6 +479,8 @@ def evaluate(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         head = ['before, mm', 'after, mm', 'after, deg']
         sizes = [f'{1e3 * one.position_m:.2f} mm' for one in (found.before, found.after)]
         words = f'Held out, the error is {sizes[0]} before and {sizes[1]} after the model.'
+        if found.after.position_m > found.before.position_m:
+            words += ' It makes this session worse: use it where it was learnt, or not at all.'
     return output.Result(
         document, output.loss_notes(session),
         (_by_sensor_text(diagnosis, head), words), (*written, args.out / 'poses.csv'),
