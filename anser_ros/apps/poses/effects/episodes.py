@@ -74,8 +74,11 @@ class Episode:
 def _sizes(
     sensing: Sensing, residuals: PoseResiduals, is_beside: bool
 ) -> tuple[Array, dict[int, Array]]:
-    """Squared errors of places and turns over the median window's: of poses (n, 2), of windows'
-    means (3,), last over `OWN`; from the middle of the windows, or beside other sensors.
+    """Squared errors of places and of turns over those of the median window: of poses (n, 2), and
+    of the means of windows (3,), in which jitter cancels; last these over `OWN`, the larger.
+
+    Errors count from the middle of the windows, as frames go a little way with an episode; or
+    beside the other sensors, which have the same clock and reference.
     """
     window, errors = windows_of(sensing, residuals), sensing.residual
     plain = middles = _middles(sensing, residuals)
@@ -109,8 +112,10 @@ def _halves(errors: Array) -> Array:
 
 @lru_cache(maxsize=8)  # of the sensors of a session, for each effect that is observed
 def episode(sensing: Sensing, residuals: PoseResiduals) -> Episode:
-    """Return when a sensor is off that was right at other times at the same places, or is off
-    whenever it comes to a place, or alone on its body.
+    """Return when a sensor is off that was right at other times at the same places.
+
+    Where it was there at no other time, the body shows it, if all others on it are right
+    meanwhile; or the place does, if the sensor is off in the same way whenever it comes back.
     """
     own = _episode(sensing, residuals, False)
     return own if own.windows else _episode(sensing, residuals, True)
