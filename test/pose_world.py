@@ -86,3 +86,8 @@ def write_tum(path, poses, start=100.0, scale=1.0):
     rows = np.c_[poses.time + start, scale * poses.position, poses.quaternion]
     np.savetxt(path, rows, fmt='%.9f')
     return str(path)
+
+
+def named(found):
+    """The effects that a diagnosis names, by name; frames are no error."""
+    return {record.name: record for record in found.records if record.name != 'hand_eye'}

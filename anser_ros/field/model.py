@@ -397,7 +397,7 @@ class FieldModel:
         now beside that: by nothing where the body is turned as it was.
         """
         known, arm = np.zeros((6, 6)), self.open_arms.get(body)
-        known.flat[:21:7] = self.shift_sigma_m**2
+        np.fill_diagonal(known[:3, :3], self.shift_sigma_m**2)
         if arm is None or rotation is None:
             return known
         away = arm.turn - rotation

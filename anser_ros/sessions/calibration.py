@@ -219,7 +219,8 @@ def _near(learnt: cKDTree, tool: Measurements) -> Measurements:
 
 def _between(measurements: Measurements, begin: float, end: float) -> Measurements:
     """The frames between two times, the first of which becomes zero."""
-    return shifted(measurements.between(begin, end), -begin)
+    inside = (measurements.time >= begin) & (measurements.time <= end)
+    return shifted(measurements.frames(inside), -begin)
 
 
 Sessions = Sequence[Session]

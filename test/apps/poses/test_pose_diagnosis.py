@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from clean_poses import MOTIONS, STREAMS, clean_world
-from pose_world import FRAME, SHIFT, World
+from pose_world import FRAME, SHIFT, World, named
 from scipy.spatial.transform import Rotation
 
 from anser_ros.apps.poses import diagnosis
@@ -24,10 +24,6 @@ from anser_ros.cli.main import run_verb
 from anser_ros.errors import DiagnosisError, PlausibilityError
 
 pytestmark = pytest.mark.long
-
-
-def named(found):
-    return {record.name: record for record in found.records if record.name != 'hand_eye'}
 
 
 def hand_eyes(found):
@@ -485,30 +481,6 @@ def test_what_fits_at_no_offset_is_refused_in_words_of_time():
     one, other = (World(seed, duration=15.0, sensors=1).session() for seed in (2, 3))
     with pytest.raises(PlausibilityError, match='best offset of their clocks, up to 16 s'):
         diagnose_poses(replace(one, reference=other.reference))
-
-
-def only_when(session, keep):
-    """The poses of all streams at some times."""
-    sensors = {name: poses.rows(keep(poses.time)) for name, poses in session.sensors.items()}
-    reference = session.reference.rows(keep(session.reference.time))
-    return replace(session, sensors=sensors, reference=reference)
-
-
-def test_a_pause_of_all_streams_lies_between_recordings():
-    session = World(2, duration=60.0).session()
-    paused = only_when(session, lambda time: (time < 16) | (time > 40))
-    assert not named(diagnose_poses(paused))
-    lost = replace(session, reference=paused.reference)
-    assert set(named(diagnose_poses(lost))) == {'missing_poses'}
-
-
-@pytest.mark.parametrize('duration', [1500.0, 3000.0])  # apart so little, motions are half alike
-def test_clocks_that_run_apart_over_several_recordings_have_a_rate(duration):
-    world = World(4, duration=duration, sensors=1, rate=8.0)
-    world.rate_ppm = 300.0
-    found = named(diagnose_poses(only_when(world.session(), lambda time: time % 300 < 25)))
-    assert set(found) == {'clock_rate'}
-    assert found['clock_rate'].parameters['rate_ppm'] == pytest.approx(300, abs=1)
 
 
 def at_rest(seed, count, length=5.0):

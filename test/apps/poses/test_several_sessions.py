@@ -5,10 +5,11 @@ import contextlib
 import csv
 import io
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from pose_world import World
+from pose_world import World, named
 
 from anser_ros.apps.poses.diagnosis import diagnose_poses
 from anser_ros.apps.poses.importing import write_pose_session
@@ -127,3 +128,27 @@ def test_a_long_pause_between_two_recordings_leaves_most_blocks_of_time_with_pos
     assert {one.name for one in found.records} == {'time_offset', 'hand_eye'}
     assert np.unique(found.fit.state.parts[0].blocks).size > 12
     assert found.after.position_m < 1e-3
+
+
+def only_when(session, keep):
+    """The poses of all streams at some times."""
+    sensors = {name: poses.rows(keep(poses.time)) for name, poses in session.sensors.items()}
+    reference = session.reference.rows(keep(session.reference.time))
+    return replace(session, sensors=sensors, reference=reference)
+
+
+def test_a_pause_of_all_streams_lies_between_recordings():
+    session = World(2, duration=60.0).session()
+    paused = only_when(session, lambda time: (time < 16) | (time > 40))
+    assert not named(diagnose_poses(paused))
+    lost = replace(session, reference=paused.reference)
+    assert set(named(diagnose_poses(lost))) == {'missing_poses'}
+
+
+@pytest.mark.parametrize('duration', [1500.0, 3000.0])  # apart so little, motions are half alike
+def test_clocks_that_run_apart_over_several_recordings_have_a_rate(duration):
+    world = World(4, duration=duration, sensors=1, rate=8.0)
+    world.rate_ppm = 300.0
+    found = named(diagnose_poses(only_when(world.session(), lambda time: time % 300 < 25)))
+    assert set(found) == {'clock_rate'}
+    assert found['clock_rate'].parameters['rate_ppm'] == pytest.approx(300, abs=1)
