@@ -14,6 +14,7 @@ from tracking_world import certain_model, flux_points, setup_of, triaxial_tool
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.streams.clouds import cloud_of
 from anser_ros.nodes.tracker import TrackerNode
+from anser_ros.wire.cdr import read_cloud
 from anser_ros.wire.points import DipolePoints, encode_field_model
 from anser_ros.wire.setup import SensorSpec, dump_setup
 
@@ -63,10 +64,9 @@ class Bench:
                 PoseWithCovarianceStamped, f'{stem}/pose_with_covariance',
                 self._keep(self.full, name), 10,
             )  # fmt: skip
-        self.peer.create_subscription(PointCloud2, 'field_model', self.models.append, qos.LATCHED)
-        self.peer.create_subscription(
-            PointCloud2, 'field_model_error', self.errors.append, qos.LATCHED
-        )
+        for name, box in (('field_model', self.models), ('field_model_error', self.errors)):
+            keep = self._read_into(box)
+            self.peer.create_subscription(PointCloud2, name, keep, qos.LATCHED, raw=True)
         self.peer.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
         self.cloud = FluxCloud('fg')
         self.stamp_ns = FIRST_NS
@@ -77,6 +77,10 @@ class Bench:
             box.setdefault(name, []).append(message)
 
         return keep
+
+    @staticmethod
+    def _read_into(box):
+        return lambda data: box.append(read_cloud(data))
 
     def _on_diagnostics(self, message):
         for status in message.status:

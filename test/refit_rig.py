@@ -1,7 +1,7 @@
 """A field_model node that refits, in the process of the test, fed by its callbacks."""
 
 import numpy as np
-from clouds_of import FluxCloud
+from clouds_of import FluxCloud, received
 from conftest import wait
 from geometry_msgs.msg import PointStamped
 from rclpy.executors import SingleThreadedExecutor
@@ -71,7 +71,7 @@ class Rig:
         flux = self.world.baseline + change + self.world.noise(self.rng)
         if fault is not None:
             flux[fault] = 0.0
-        self.node._on_flux(self.message(self.world.references.channel, flux))
+        self.node._on_flux(received(self.message(self.world.references.channel, flux)))
         self.executor.spin_once(timeout_sec=0.0)
 
     def give_baseline(self):

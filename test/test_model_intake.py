@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from clouds_of import message_of
 from tracking_world import certain_model, setup_of, triaxial_tool
 
 from anser_ros.chain.frame import MOST_LATE, AnsweredFrames
 from anser_ros.nodes.streams.clouds import ModelWriter
 from anser_ros.nodes.tracker_models import ModelIntake, ModelReader
+from anser_ros.wire.cdr import read_cloud
 
 pytest.importorskip('sensor_msgs')
 MODEL = certain_model()
@@ -25,15 +25,15 @@ def messages(numbers):
     """Uncertainty and dipoles of some models, with the stamps of their numbers."""
     writer = ModelWriter()
     models = {n: writer.given(uncertain(n), FIRST_NS + n, True) for n in numbers}
-    errors = {n: message_of(writer.error(model, 'fg')) for n, model in models.items()}
-    return errors, {n: message_of(writer.dipoles(model, 'fg')) for n, model in models.items()}
+    errors = {n: read_cloud(writer.error(model, 'fg')) for n, model in models.items()}
+    return errors, {n: read_cloud(writer.dipoles(model, 'fg')) for n, model in models.items()}
 
 
 def taken(intake, maker, *of_model):
     """The model of two messages."""
     given = maker.given(*of_model)
-    intake.take_error(message_of(maker.error(given, 'fg')))
-    return intake.take(message_of(maker.dipoles(given, 'fg')))
+    intake.take_error(read_cloud(maker.error(given, 'fg')))
+    return intake.take(read_cloud(maker.dipoles(given, 'fg')))
 
 
 def size_of(given):
@@ -103,7 +103,7 @@ def test_published_models_become_answers_that_share_what_is_the_same():
     assert 'no reference readings yet, or too few' in answers[2].withheld.reason
     assert answers[3].withheld.state == 'references_doubtful'
     given = maker.given(MODEL, now + 4, True, 2)  # of the same uncertainty, so not said again
-    last = reader.answer(intake.take(message_of(maker.dipoles(given, 'fg'))))
+    last = reader.answer(intake.take(read_cloud(maker.dipoles(given, 'fg'))))
     assert last.model is answers[3].model and last.name == str(now + 4)
 
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from anser_ros.errors import LayoutError
-from anser_ros.wire.cdr import cloud_bytes, cloud_head
+from anser_ros.wire.cdr import cloud_bytes, read_cloud
 from anser_ros.wire.points import (
     DROPPED,
     FLOAT32,
@@ -148,13 +148,47 @@ def test_more_points_than_channels_are_refused_before_they_are_read():
         decode_flux(fields, step, count, bytes(step * count))
 
 
-def test_the_head_of_a_cloud_is_read_without_the_rest():
+@pytest.mark.parametrize('order', ['<', '>'])
+def test_a_cloud_is_read_as_the_middleware_reads_it(order):
+    """Of either byte order; what is cut off anywhere is refused, and so are absurd counts."""
     fields, step, data = encode_flux(flux_points())
-    whole = cloud_bytes(5, 'a frame of any length', fields, step, 4, data)
-    assert cloud_head(whole) == (1, 4, len(fields))
-    assert cloud_head(whole[:60]) == (1, 4, len(fields))
-    with pytest.raises(LayoutError, match='no cloud in 30 bytes'):
-        cloud_head(whole[:30])
+    whole = cloud_bytes(5, 'a frame of any length', fields, step, len(data) // step, data)
+    if order == '>':
+        whole = swapped(whole, len(fields))
+    cloud = read_cloud(whole)
+    assert cloud.header == ((0, 5), 'a frame of any length')
+    assert (cloud.height, cloud.width, cloud.point_step) == (1, len(data) // step, step)
+    assert (cloud.fields, bytes(cloud.data), cloud.is_bigendian) == (fields, data, False)
+    for end in range(4, len(whole) - 1):
+        with pytest.raises(LayoutError, match=r'no cloud in|ends after'):
+            read_cloud(whole[:end])
+
+
+def swapped(cloud, n_fields):
+    """Return a serialised cloud with its words in the other byte order."""
+    body, place = bytearray(cloud[4:]), 0
+
+    def turn(count=1):
+        nonlocal place
+        place += -place % 4
+        for at in range(place, place + 4 * count, 4):
+            body[at : at + 4] = body[at : at + 4][::-1]
+        place += 4 * count
+        return int.from_bytes(body[place - 4 : place], 'big')
+
+    turn(2)
+    size = turn()
+    place += size
+    turn(3)
+    for _ in range(n_fields):
+        size = turn()
+        place += size
+        turn()
+        place += 1
+        turn()
+    place += 1
+    turn(3)
+    return b'\x00\x00\x00\x00' + bytes(body)
 
 
 SEED = 51

@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 import pytest
-from clouds_of import message_of
+from clouds_of import received
 from geometry_msgs.msg import PoseStamped
 from refit_rig import HEAD, STEP_NS, Rig, setup_text
 from refit_world import metal_block
@@ -23,6 +23,7 @@ from anser_ros.pose_states import OTHER_MODEL, REFERENCES_LOST, code_of
 from anser_ros.refit.model import Metal
 from anser_ros.sessions.starting_model import load_model
 from anser_ros.stamps import stamp_of
+from anser_ros.wire.cdr import read_cloud
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
 
@@ -104,7 +105,7 @@ def test_every_kind_of_bad_flux_has_its_counter_as_in_the_tracker(make):
             whole = {'frame_id': message.header, 'nanosec': message.header.stamp, 'sec':
                      message.header.stamp}.get(name, message)  # fmt: skip
             setattr(whole, name, value)
-        node._on_flux(message)
+        node._on_flux(received(message))
 
     before = node._stamp_ns
     send(frame_id='world')
@@ -279,9 +280,9 @@ def test_markers_of_nothing_and_of_one_source(ros):
 def test_lost_references_are_told_to_the_trackers_and_to_the_operator(make):
     rig, intake, given = make(refit_rate_hz=1000.0), ModelIntake(), []
     rig.node._on_setup(String(data=setup_text(rig.world, references_age_s=2.0)))
-    rig.node._output.errors.publish = lambda message: intake.take_error(message_of(message))
+    rig.node._output.errors.publish = lambda message: intake.take_error(read_cloud(message))
     rig.node._output.models.publish = lambda message: given.append(
-        intake.take(message_of(message))
+        intake.take(read_cloud(message))
     )
     rig.start()
     change = rig.world.metal(HEAD)

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import PointCloud2
 from tracking_world import flux_points
 
 from anser_ros.apps.dashboard.nodes.monitor import Monitor
@@ -18,6 +17,7 @@ from anser_ros.nodes.replay import Replay
 from anser_ros.nodes.streams.clouds import read_frame
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.bag_writer import SessionWriter
+from anser_ros.wire.cdr import CloudHeader, PointCloud, Stamp
 from anser_ros.wire.points import encode_flux
 from anser_ros.wire.recorded import optical_topic
 
@@ -81,9 +81,8 @@ def test_clouds_and_metal_have_their_boards_prefix(ros):
         assert (node._shown_frame, node._frame_id) == ('left_fg', 'fg')
     finally:
         node.destroy_node()
-    cloud = PointCloud2()
     for frame, said in (('left_fg', 'no stamp'), ('base', "frame 'base'"), ('wfg', "'wfg'")):
-        cloud.header.frame_id = frame
+        cloud = PointCloud(CloudHeader(Stamp(0, 0), frame), 1, 0, [], False, 0, memoryview(b''))
         with pytest.raises(LayoutError, match=said):
             read_frame(cloud, 'fg', lambda *_: None)
 

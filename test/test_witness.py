@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from clouds_of import FluxCloud
+from clouds_of import FluxCloud, received
 from conftest import REPO
 from geometry_msgs.msg import PoseStamped
 from refit_world import NOISE_T, anser_world, metal_block, metal_flux
@@ -222,7 +222,7 @@ def flux(stamp_ns, level):
     """A frame of all of the tool's channels, each emitter with the same flux."""
     values = np.full((len(CHANNELS), 8), level, dtype=np.complex128)
     values[2] = np.nan
-    return FluxCloud('fg').message(flux_points(values, channels=CHANNELS), stamp_ns)
+    return received(FluxCloud('fg').message(flux_points(values, channels=CHANNELS), stamp_ns))
 
 
 def pose(stamp_ns, x, frame_id='fg'):

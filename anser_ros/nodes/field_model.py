@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -39,6 +38,7 @@ from anser_ros.sessions.starting_model import (
     starting_model,
 )
 from anser_ros.stamps import is_live
+from anser_ros.wire.cdr import PointCloud
 from anser_ros.wire.setup import Setup, parse_setup
 
 
@@ -183,7 +183,7 @@ class FieldModelNode(AnserNode):
             if not (table.baseline_at_start or self._refit.is_making):
                 self.get_logger().warning(field_model_refit.no_baseline(self.get_namespace()))
 
-    def _on_flux(self, message: PointCloud2) -> None:
+    def _on_flux(self, message: PointCloud) -> None:
         if self._setup is None:
             self.count('fluxes_before_setup')
             return

@@ -48,6 +48,7 @@ from anser_ros.sessions.kept_tables import DAMAGED, read_arrays, used_s, write_a
 from anser_ros.sessions.session import sensor_table, tracking_noise
 from anser_ros.stamps import set_stamp, stamp_of
 from anser_ros.tracking.estimate import PoseEstimate
+from anser_ros.wire.cdr import PointCloud
 from anser_ros.wire.points import ModelError
 from anser_ros.wire.recorded import pose_numbers, unit_quaternions
 from anser_ros.wire.setup import Setup, topic_of
@@ -375,7 +376,7 @@ class ToolWitnesses:
             self._node.warn('witnesses_of_two_sources', text)
         return count <= 1
 
-    def _on_flux(self, message: PointCloud2) -> None:
+    def _on_flux(self, message: PointCloud) -> None:
         try:
             stamp_ns, points = read_frame(message, self._frame_id(), self._node.count)
             _keep(self._frames, stamp_ns, readings_of(points))

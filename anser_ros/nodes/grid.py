@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -17,6 +16,7 @@ from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.streams.clouds import read_frame
 from anser_ros.nodes.streams.one_source import NewestSource, sender_words, setup_source
 from anser_ros.sessions.plate import PLATES, PlateGuide, places_of
+from anser_ros.wire.cdr import PointCloud
 from anser_ros.wire.setup import parse_setup
 
 ACTIONS = ('undo', 'skip', 'keep', 'end')
@@ -86,7 +86,7 @@ class GridGuide(AnserNode):
                 return
             self._show(KEYS)
 
-    def _on_flux(self, message: PointCloud2) -> None:
+    def _on_flux(self, message: PointCloud) -> None:
         guide = self._guide
         if guide is not None:
             stamp_ns, points = read_frame(message, guide.setup.frame_id, self.count)

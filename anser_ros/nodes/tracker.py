@@ -45,6 +45,7 @@ from anser_ros.sessions.starting_model import check_emitters, model_of
 from anser_ros.stamps import SECOND_NS, is_live
 from anser_ros.tracking.estimate import NO_GATE, USUAL_GATE, PoseEstimate, Tip, TrackerSettings
 from anser_ros.tracking.tracker import Tracker, warm_up
+from anser_ros.wire.cdr import PointCloud
 from anser_ros.wire.setup import Setup, parse_setup
 from anser_ros.wire.setup_values import TipSpec, read_tips, tip_name
 from anser_ros.wire.text_files import read_text
@@ -236,7 +237,7 @@ class TrackerNode(AnserNode):
             same = replace(self._settings, volume=self._half.tracker.settings.volume)
             self._half.set_up(settings_for(setup, same, self._file_model))
 
-    def _take_model(self, take: Callable[[Any], GivenModel | None], message: PointCloud2) -> None:
+    def _take_model(self, take: Callable[[Any], GivenModel | None], message: PointCloud) -> None:
         try:
             given = take(message)
         except AnserError as error:
@@ -285,7 +286,7 @@ class TrackerNode(AnserNode):
         """Use a model for its own frame or, of what is live, for the one after it."""
         self._use_model(given, self._is_live)
 
-    def _on_flux(self, message: PointCloud2, is_doubted: bool = False) -> None:
+    def _on_flux(self, message: PointCloud, is_doubted: bool = False) -> None:
         """Track a frame when its model is there, or after so long; say at once of one that may be
         another sender's why it has no poses.
         """
@@ -298,7 +299,7 @@ class TrackerNode(AnserNode):
             if self._frames.waiting:
                 self._wait.reset()
 
-    def _lasting(self, message: PointCloud2) -> bytes | None:
+    def _lasting(self, message: PointCloud) -> bytes | None:
         """Return what a model says until there is another; None while each frame has its own."""
         return None if self._frames.follows else bytes(message.data.tobytes())
 
@@ -308,7 +309,7 @@ class TrackerNode(AnserNode):
         if not self._frames.waiting:
             self._wait.cancel()
 
-    def _read(self, message: PointCloud2) -> tuple[int, FrameReadings] | None:
+    def _read(self, message: PointCloud) -> tuple[int, FrameReadings] | None:
         """Stamp and readings of a frame that can be tracked, or None for one that is refused."""
         setup = self._setup
         if setup is None:

@@ -5,14 +5,13 @@
 from collections import deque
 from typing import Any
 
-from sensor_msgs.msg import PointCloud2
-
 from anser_ros.chain.frame import Answer
 from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
 from anser_ros.nodes.streams.clouds import GivenModel, read_dipoles, read_error
 from anser_ros.pose_states import OTHER_MODEL, REFERENCES_LOST, UNCALIBRATED, Withheld
 from anser_ros.stamps import stamp_of
+from anser_ros.wire.cdr import PointCloud
 from anser_ros.wire.points import DipolePoints, ModelError
 from anser_ros.wire.setup import Setup
 
@@ -31,7 +30,7 @@ class ModelIntake:
         self._data = b''  # Of the newest model's dipoles
         self._read: tuple[int, ModelError] | None = None
         # Uncertainties that came before their models, in the order of their arrival.
-        self._early: deque[PointCloud2] = deque(maxlen=MOST_EARLY)
+        self._early: deque[PointCloud] = deque(maxlen=MOST_EARLY)
 
     @property
     def has_error(self) -> bool:
@@ -39,7 +38,7 @@ class ModelIntake:
         newest = self.newest
         return bool(self._early) or (newest is not None and newest.error is not None)
 
-    def take(self, message: PointCloud2) -> GivenModel:
+    def take(self, message: PointCloud) -> GivenModel:
         """Read a ``field_model`` message.
 
         Raises `LayoutError` when it is not a field model, or has no stamp.
@@ -53,7 +52,7 @@ class ModelIntake:
         self._data = data
         return self._joined(stamp_ns, points)
 
-    def take_error(self, message: PointCloud2) -> GivenModel | None:
+    def take_error(self, message: PointCloud) -> GivenModel | None:
         """Keep an uncertainty; return the newest model with it where it is of that model.
 
         Raises `LayoutError` when it does not belong to that model.

@@ -21,7 +21,7 @@ from anser_ros.stamps import JUMP_NS, stamp_of
 from anser_ros.wire import recorded
 from anser_ros.wire.bag_files import Salvage as Salvage
 from anser_ros.wire.bag_files import files_of, messages_in, unpacked
-from anser_ros.wire.cdr import DEFINITIONS
+from anser_ros.wire.cdr import DEFINITIONS, read_cloud
 from anser_ros.wire.points import STALE, FluxPoints, decode_flux
 from anser_ros.wire.setup import parse_setup
 from anser_ros.wire.text_files import path_of
@@ -136,12 +136,9 @@ class _Collector:
     def _add_flux(self, raw: RawMessage) -> None:
         if raw.type_name != recorded.FLUX_TYPE:
             raise LayoutError(f'type {raw.type_name} where {recorded.FLUX_TYPE} belongs')
-        cloud = self.decoder.decode(raw)
-        fields = [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields]
-        width = int(cloud.width) * int(cloud.height)
-        points = decode_flux(
-            fields, cloud.point_step, width, bytes(cloud.data), cloud.is_bigendian
-        )
+        cloud = read_cloud(raw.data)
+        width = cloud.width * cloud.height
+        points = decode_flux(cloud.fields, cloud.point_step, width, cloud.data, cloud.is_bigendian)
         stamp = stamp_of(cloud)
         if stamp == 0:
             raise LayoutError('stamp zero')

@@ -97,37 +97,34 @@ def _records(
     return np.frombuffer(data, dtype=record, count=width)
 
 
-def _columns(records: NDArray[np.void], names: Sequence[str]) -> Array:
+@lru_cache(maxsize=8)
+def _doubles(names: tuple[str, ...]) -> np.dtype[np.void]:
+    return np.dtype([(name, np.float64) for name in names])
+
+
+def _columns(records: NDArray[np.void], names: tuple[str, ...]) -> Array:
     present = records.dtype.names or ()
     missing = [name for name in names if name not in present]
     if missing:
         raise LayoutError(f'the cloud lacks the field {missing[0]!r}')
-    out = np.empty((records.shape[0], len(names)))
     with np.errstate(invalid='ignore'):  # a signalling NaN is as good as any other
-        for i, name in enumerate(names):
-            out[:, i] = records[name]
-    return out
+        out = records[[*names]].astype(_doubles(names))
+    return out.view(np.float64).reshape(len(records), len(names))
 
 
-def _integers(records: NDArray[np.void], name: str) -> Integers:
-    values = _columns(records, (name,))[:, 0]
+def _integers(values: Array, name: str) -> Integers:
     if not (np.abs(values) < 2.0**31).all():
         raise LayoutError(f'the field {name!r} holds values that are not small integers')
     return values.astype(np.int64)
 
 
-def _phasors(records: NDArray[np.void], stem: str) -> ComplexArray:
+def _phasors_of(records: NDArray[np.void], stem: str) -> list[str]:
+    """Return the names of the columns of all phasors, one at least."""
     present = set(records.dtype.names or ())
     count = 0
     while f'{stem}{count}_re' in present or f'{stem}{count}_im' in present:
         count += 1
-    if count == 0:
-        raise LayoutError(f'the cloud lacks the field {f"{stem}0_re"!r}')
-    real = _columns(records, [f'{stem}{k}_re' for k in range(count)])
-    imag = _columns(records, [f'{stem}{k}_im' for k in range(count)])
-    phasors = np.empty(real.shape, dtype=np.complex128)
-    phasors.real, phasors.imag = real, imag  # 1j times an infinity would be a NaN
-    return phasors
+    return phasor_names(stem, max(count, 1))
 
 
 def decode_flux(
@@ -139,16 +136,17 @@ def decode_flux(
 ) -> FluxPoints:
     """Read a flux cloud; raises `LayoutError` with what is wrong with fields, size or values."""
     records = _records(fields, point_step, width, data, is_bigendian)
-    geometry = _columns(records, ('x', 'y', 'z', 'nx', 'ny', 'nz'))
-    channel = _integers(records, 'channel')
+    rest = 'channel', 'flags', *_phasors_of(records, 'coil')
+    values = _columns(records, ('x', 'y', 'z', 'nx', 'ny', 'nz', *rest))
+    channel = _integers(values[:, 6], 'channel')
     if len(set(channel.tolist())) != channel.size:
         raise LayoutError('a channel appears twice in the cloud')
     return FluxPoints(
         channel=channel,
-        flags=_integers(records, 'flags'),
-        flux=_phasors(records, 'coil'),
-        position=geometry[:, :3],
-        axis=geometry[:, 3:],
+        flags=_integers(values[:, 7], 'flags'),
+        flux=np.ascontiguousarray(values[:, 8:]).view(np.complex128),
+        position=values[:, :3],
+        axis=values[:, 3:6],
     )
 
 
@@ -201,11 +199,12 @@ def decode_field_model(
 ) -> DipolePoints:
     """Read a field model cloud; `LayoutError` as `decode_flux`, and on values not finite."""
     records = _records(fields, point_step, width, data, is_bigendian)
-    geometry = _columns(records, ('x', 'y', 'z', 'ux', 'uy', 'uz'))
-    moments = _phasors(records, 'm')
-    if not (np.isfinite(geometry).all() and np.isfinite(moments).all()):
+    phasors = _phasors_of(records, 'm')
+    values = _columns(records, ('x', 'y', 'z', 'ux', 'uy', 'uz', *phasors))
+    if not np.isfinite(values).all():
         raise LayoutError('the field model holds values that are not finite')
-    return DipolePoints(geometry[:, :3], geometry[:, 3:], moments)
+    moments = np.ascontiguousarray(values[:, 6:]).view(np.complex128)
+    return DipolePoints(values[:, :3], values[:, 3:6], moments)
 
 
 def encode_field_model(points: DipolePoints) -> tuple[list[PointFieldTuple], int, bytes]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sensor_msgs.msg import PointCloud2
 
 from anser_ros.chain.frame import FrameReadings
 from anser_ros.effects.correction import needs_correction
@@ -17,7 +16,7 @@ from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Count
 from anser_ros.pose_states import state_of
 from anser_ros.stamps import SECOND_NS, stamp_of
-from anser_ros.wire.cdr import cloud_bytes
+from anser_ros.wire.cdr import PointCloud, cloud_bytes
 from anser_ros.wire.points import (
     DipolePoints,
     FluxPoints,
@@ -66,15 +65,14 @@ def _is_dense(points: FluxPoints) -> bool:
     return not ((flux != flux).any() or (place != place).any())  # no NaN
 
 
-def layout_of(message: PointCloud2) -> tuple[list[PointFieldTuple], int, int, Any]:
-    """Return the fields of a cloud as plain tuples, its point_step, its points and its bytes.
+def layout_of(cloud: PointCloud) -> tuple[list[PointFieldTuple], int, int, memoryview]:
+    """Return the fields of a cloud, its point_step, its points and its bytes.
 
     Raises `LayoutError` when the cloud has more rows than one.
     """
-    if message.height != 1:
-        raise LayoutError(f'the cloud must have height 1, got {message.height}')
-    fields = [(f.name, f.offset, f.datatype, f.count) for f in message.fields]
-    return fields, message.point_step, int(message.width), message.data
+    if cloud.height != 1:
+        raise LayoutError(f'the cloud must have height 1, got {cloud.height}')
+    return cloud.fields, cloud.point_step, cloud.width, cloud.data
 
 
 def is_frame(given_id: str, frame_id: str) -> bool:
@@ -82,7 +80,7 @@ def is_frame(given_id: str, frame_id: str) -> bool:
     return given_id == frame_id or given_id.endswith((f'_{frame_id}', f'/{frame_id}'))
 
 
-def read_frame(message: PointCloud2, frame_id: str, count: Count) -> tuple[int, FluxPoints]:
+def read_frame(message: PointCloud, frame_id: str, count: Count) -> tuple[int, FluxPoints]:
     """Read a flux message that must be in a frame, with any prefix; its peculiarities are counted.
 
     The counters are ``fluxes_big_endian``, ``fluxes_other_frame_id``, ``fluxes_without_stamp``.
@@ -101,7 +99,7 @@ def read_frame(message: PointCloud2, frame_id: str, count: Count) -> tuple[int, 
         raise LayoutError(f'the stamp has {nanosec} nanoseconds, a second or more')
     if stamp_ns <= 0:
         raise LayoutError('the flux message has no stamp')
-    return stamp_ns, decode_flux(*layout_of(message), bool(message.is_bigendian))
+    return stamp_ns, decode_flux(*layout_of(message), message.is_bigendian)
 
 
 def readings_of(points: FluxPoints) -> FrameReadings:
@@ -167,13 +165,13 @@ class ModelWriter:
         return cloud_of(encode_model_error(given.error), frame_id, given.stamp_ns)
 
 
-def read_dipoles(message: PointCloud2) -> DipolePoints:
+def read_dipoles(message: PointCloud) -> DipolePoints:
     """Read a ``field_model`` message.
 
     Raises `LayoutError` when it is not a field model, has no dipole, or a direction is no unit
     vector.
     """
-    points = decode_field_model(*layout_of(message), bool(message.is_bigendian))
+    points = decode_field_model(*layout_of(message), message.is_bigendian)
     if len(points.positions) == 0:
         raise LayoutError('the field model has no dipole')
     norms = np.linalg.norm(points.directions, axis=1)
@@ -182,6 +180,6 @@ def read_dipoles(message: PointCloud2) -> DipolePoints:
     return points
 
 
-def read_error(message: PointCloud2, n_dipoles: int, n_emitters: int) -> ModelError:
+def read_error(message: PointCloud, n_dipoles: int, n_emitters: int) -> ModelError:
     """Read a ``field_model_error`` message for a model of that size; raises `LayoutError`."""
     return decode_model_error(*layout_of(message), n_dipoles, n_emitters)

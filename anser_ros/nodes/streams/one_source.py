@@ -20,6 +20,7 @@ from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, opened
 from anser_ros.nodes.streams.clouds import without_measured
 from anser_ros.stamps import NANO, SECOND_NS, is_live, stamp_of
+from anser_ros.wire.cdr import PointCloud
 
 
 def too_slow(skipped: int, worked: int) -> str:
@@ -221,7 +222,7 @@ class NewestSource(OneSource):
         self._works_later, self.backlog = works_later, Backlog()
         super().__init__(node, PointCloud2, topic, callback, qos.STREAM, doubted)
 
-    def _deliver(self, message: PointCloud2, info: Mapping[str, Any]) -> None:
+    def _deliver(self, message: PointCloud, info: Mapping[str, Any]) -> None:
         newest = self._newest(message, info)
         begin_s = time.perf_counter()
         if newest is not None:
@@ -229,7 +230,7 @@ class NewestSource(OneSource):
         if not self._works_later:
             self.backlog.worked(time.perf_counter() - begin_s)
 
-    def _newest(self, message: PointCloud2, info: Mapping[str, Any]) -> PointCloud2 | None:
+    def _newest(self, message: PointCloud, info: Mapping[str, Any]) -> PointCloud | None:
         """The message, or the newest that waits; None where those that wait are another's."""
         received_ns = info.get('received_timestamp') or info.get('source_timestamp') or 0
         now_ns, stamp_ns = time.time_ns(), stamp_of(message)
@@ -246,7 +247,8 @@ class NewestSource(OneSource):
         if not waiting:
             return message
         self._node.count('frames_skipped', len(waiting))
-        return opened(waiting[-1][0], PointCloud2)
+        newest: PointCloud = opened(waiting[-1][0], PointCloud2)
+        return newest
 
 
 def take_waiting(subscription: Any) -> list[tuple[bytes, dict[str, int]]]:

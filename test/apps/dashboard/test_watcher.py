@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from clouds_of import message_of
 from conftest import REPO, diagnostics, spin_until
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
@@ -21,6 +20,7 @@ from anser_ros.sessions.starting_model import load_model
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.bag_writer import SessionWriter
+from anser_ros.wire.cdr import read_cloud
 from anser_ros.wire.points import FluxPoints
 
 MODEL = REPO / 'config' / 'demo_model.yaml'
@@ -248,7 +248,7 @@ def test_fluxes_of_another_frame_are_counted_and_not_looked_at(ros, moving):
                 (moving.reference, 'reference/flux'),
             ):
                 cloud = flux_cloud(points(stream, 0), frame_id, int(stream.stamp_ns[0]))
-                streams.on_fluxes(topic, message_of(cloud))
+                streams.on_fluxes(topic, read_cloud(cloud))
             if frame_id == 'world':
                 assert streams.window.session() is None
                 assert node.counters['fluxes_other_frame_id'] == 2

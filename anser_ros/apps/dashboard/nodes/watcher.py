@@ -35,6 +35,7 @@ from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import empty_session, load_session
 from anser_ros.sessions.starting_model import NOMINAL, load_model, model_for
 from anser_ros.stamps import stamp_of
+from anser_ros.wire.cdr import PointCloud
 from anser_ros.wire.recorded import optical_topic, pose_numbers
 from anser_ros.wire.setup import parse_setup
 
@@ -156,7 +157,7 @@ class FluxStreams:
         if self.window is not None:
             self.window.take_pose(body, stamp_of(message), pose_numbers(message.pose))
 
-    def on_fluxes(self, topic: str, message: PointCloud2) -> None:
+    def on_fluxes(self, topic: str, message: PointCloud) -> None:
         window = self.window
         if window is None:
             return
