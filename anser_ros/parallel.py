@@ -24,7 +24,8 @@ ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
 """Variables that give BLAS one thread, if set before numpy is imported; its matrices are small."""
 TURN_S = 1e-4
 """Longest that a thread waits for the interpreter, s, while others work in Python: about a call of
-numpy. With Python's 5 ms two threads of a diagnosis are no faster than one."""
+numpy. With Python's 5 ms two threads of a diagnosis are no faster than one; with 1 ms the slowest
+hundredth of the poses of `live` came 29 to 62 ms late on a busy computer, with this 20 to 27."""
 KEEP_MEMORY = {-1: 2**31 - 1, -4: 0, -8: 1}
 """The GNU C library's mallopt: freed bytes kept, arrays with pages of their own, arenas. New pages
 take a tenth of the time."""

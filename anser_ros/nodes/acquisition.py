@@ -22,9 +22,10 @@ from anser_ros.nodes.acquisition_stream import FluxFrame, FluxStream, MeasuredAc
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import parameter, prefix_parameter
-from anser_ros.nodes.runtime.process import TURN_S, main
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.streams.clouds import flux_cloud, readings_of
 from anser_ros.nodes.streams.one_source import Backlog, too_slow
+from anser_ros.parallel import TURN_S
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.frames import (
     TYPE_OF,

@@ -10,8 +10,9 @@ import sys
 from anser_ros.chain.chain import Chain
 from anser_ros.nodes.acquisition import Acquisition
 from anser_ros.nodes.field_model import FieldModelNode
-from anser_ros.nodes.runtime.process import TURN_S, main
+from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.tracker import TrackerNode
+from anser_ros.parallel import TURN_S
 
 CHAIN = (Acquisition, FieldModelNode, TrackerNode)
 """In the order in which they are made and joined."""

@@ -64,9 +64,6 @@ SPIN_SLICE_S = 0.1
 ENDING = (signal.SIGINT, signal.SIGTERM)
 NOTICE_S = 1.0
 """How long, s, a busy process may take to notice that it is to end, before it is ended."""
-TURN_S = 1e-3
-"""Time, s, after which a thread lets another one have its turn where samples are received, and so
-the error in the time at which bytes arrive; Python's own is 5 ms."""
 
 
 def main(
