@@ -14,6 +14,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from anser_ros.errors import PortError, SetupError
+from anser_ros.nodes.acquisition_status import clock_troubles
 from anser_ros.nodes.acquisition_stream import FluxStream
 from anser_ros.nodes.runtime import qos
 from anser_ros.simulation.control_unit import Piece
@@ -148,6 +149,7 @@ def test_fluxes_arrive_with_layout_stamps_and_health(chain):
     assert_on_grid(times, 0.005)
     for process in (acquisition, simulator):
         assert process.interrupt() == 0, process.output
+        assert 'ERROR' not in process.output, 'what ends well is no fault of another process'
 
 
 def test_every_fault_is_survived_counted_and_named(chain):
@@ -297,10 +299,12 @@ class TestStream:
         assert stream.blocks_wanted == 16
         assert not any(self.push(stream, k, 50) for k in range(100, 120))
         assert stream._waiting and stream.blocks_wanted == 1
+        assert stream.clock.is_doubted and not clock_troubles(stream), 'some came in time lately'
         (frame,) = self.push(stream, 120)
         assert frame.host_ns == pytest.approx(10**12 + 110 * 10**6, abs=10**5)
         assert not any(self.push(stream, k, 900) for k in range(121, 1000))
         assert stream.withheld > 20 and stream.clock.wants_answer
+        assert clock_troubles(stream)[0][1] == 'clock: everything arrives 0.9 s late'
 
     def test_an_answer_behind_lost_blocks_moves_no_stamps(self):
         """A full line drops blocks, but no answer, and all that it carries is as late."""

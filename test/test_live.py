@@ -127,7 +127,7 @@ def test_frames_pass_the_nodes_of_one_process_as_objects(joined, ros):
     assert states[-1] == {'ok'}
     for node in (joined.model, joined.tracker):
         assert node._fluxes.subscription is None, 'it would process everything twice'
-    assert joined.tracker._intake.newest is joined.model._output.newest
+    assert joined.tracker._given is joined.model._output.newest
     stranger = ros.create_node('stranger')
     for _ in range(2):
         stranger.create_publisher(PointCloud2, '/anser/tool/flux', qos.STREAM)

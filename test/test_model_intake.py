@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from tracking_world import certain_model, setup_of, triaxial_tool
 
-from anser_ros.chain.frame import MOST_LATE, AnsweredFrames
+from anser_ros.chain.chain import MOST_LATE, AnsweredFrames
+from anser_ros.chain.frame import Answer, ChainFrame
 from anser_ros.nodes.streams.clouds import ModelWriter
 from anser_ros.nodes.tracker_models import ModelIntake, ModelReader
 from anser_ros.wire.cdr import read_cloud
@@ -76,13 +77,11 @@ def test_one_whose_model_was_lost_is_passed_over():
     for n in (0, 1, 3):
         intake.take_error(errors[n])
     assert [size_of(intake.take(models[n])) for n in (0, 3)] == [1, 4]
-    assert intake.has_error
+    assert size_of(intake.newest) == 4
 
 
 def test_what_is_not_said_yet_is_unknown_but_a_shift_from_the_file():
-    intake = ModelIntake()
-    assert intake.take(messages([0])[1][0]).error is None
-    assert not intake.has_error
+    assert ModelIntake().take(messages([0])[1][0]).error is None
     given = ModelIntake().take(messages([0])[1][0])
     setup = setup_of(triaxial_tool())
     for own, size in ((None, 0.0), (replace(MODEL, shift_sigma_m=1e-3), 1e-3)):
@@ -115,21 +114,25 @@ class Log:
     """A queue whose frames note the model in force."""
 
     def __init__(self, follows=True):
-        self.model, self.tracked = None, []
-        self.queue = AnsweredFrames(self.use, self.track)
+        self.model, self.tracked, self.used = None, [], []
+        self.queue = AnsweredFrames(self)
         self.queue.follows = follows
 
-    def use(self, model):
-        self.model = model
+    def use(self, answer, ahead):
+        self.model = answer.model
+        self.used.append((answer.model, ahead))
 
-    def track(self, frame):
-        self.tracked.append((frame, self.model))
+    def step(self, _stamp_ns, tools):
+        self.tracked.append((tools, self.model))
+        return []
 
-    def say(self, n, name=None, now_s=0.0):
-        self.queue.add_model(FIRST_NS + n * STEP_NS, n if name is None else name, now_s)
+    def say(self, n, name=None, stamp_ns=None):
+        answer = Answer(stamp_ns or FIRST_NS + n * STEP_NS, n if name is None else name)
+        self.queue.add_answer(answer, 0.0)
 
-    def frame(self, n, now_s=0.0):
-        self.queue.add_frame(FIRST_NS + n * STEP_NS, n, now_s, WAIT_S)
+    def frame(self, n, now_s=0.0, lags=False):
+        frame = ChainFrame(FIRST_NS + n * STEP_NS, n, None)
+        self.queue.add_frame(frame, now_s, WAIT_S, lags)
 
 
 ORDERS = {
@@ -160,14 +163,14 @@ def test_a_live_frame_gets_the_model_of_the_instant_before(order):
     log, frames, models = Log(), set(), set()
     for event in order:
         if isinstance(event, int):
-            log.queue.add_frame(FIRST_NS + event * STEP_NS, event, 0.0, WAIT_S, lags=True)
+            log.frame(event, lags=True)
             frames.add(event)
         else:
             log.say(int(event[1:]))
             models.add(int(event[1:]))
         ready = [n for n in sorted(frames) if max(n - 1, 0) in models]
         assert log.tracked == [(n, max(n - 1, 0)) for n in ready], 'the first has its own'
-    assert log.queue.late == 0
+    assert log.queue.late == 0 and all(ahead for _, ahead in log.used[1:])
 
 
 def test_no_answer_delays_a_few_frames_and_then_none():
@@ -208,7 +211,7 @@ def test_a_model_with_another_clock_s_stamp_is_used_at_once(follows):
     log = Log(follows)
     log.frame(0)
     log.say(0)
-    log.queue.add_model(FIRST_NS * 2, 'reset', 0.0)
+    log.say(0, 'reset', FIRST_NS * 2)
     assert log.model == 'reset'
     log.frame(1)
     assert log.queue.waiting == follows, 'a reset is no answer'
@@ -216,7 +219,7 @@ def test_a_model_with_another_clock_s_stamp_is_used_at_once(follows):
 
 def test_nobody_waits_for_a_server_that_does_not_follow():
     log = Log(follows=False)
-    log.queue.add_model(5, 'base', 0.0)
+    log.say(0, 'base', 5)
     for n in range(3):
         log.frame(n)
     assert log.tracked == [(n, 'base') for n in range(3)]
@@ -229,12 +232,11 @@ def test_nobody_waits_for_a_server_that_does_not_follow():
 def test_only_the_newest_of_many_is_used():
     log = Log(follows=False)
     log.frame(0)
-    used = []
-    log.queue._use = used.append
+    log.used.clear()
     for n in range(1, 30):
         log.say(n)
     log.frame(30)
-    assert used == [29]
+    assert log.used == [(29, False)]
 
 
 def test_a_recording_that_begins_again():

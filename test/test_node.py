@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,8 @@ from anser_ros.nodes.runtime.diagnostics import Throttle
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import complaints, parameter
 from anser_ros.parallel import ONE_THREAD
+from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.text_files import read_config
 
 pytestmark = pytest.mark.light
 
@@ -66,6 +69,15 @@ class TestParameterTable:
     def test_refusals(self, values, said):
         with pytest.raises(ParameterError, match=said):
             parameters.build(Table, values)
+
+    def test_a_file_is_found_in_config_too_and_an_error_states_the_parameter(self, tmp_path):
+        read = partial(parameters.from_text, 'setup_file', parse=parse_setup)
+        assert read('demo_setup.yaml') == parse_setup(read_config('demo_setup.yaml'))
+        assert read('', none=3) == 3 and read('nominal') is None
+        (broken := tmp_path / 'broken.yaml').write_text('schema: other')
+        for name, said in (('none.yaml', 'no file none.yaml'), (broken, 'setup: schema must be')):
+            with pytest.raises(SetupError, match=f'parameter setup_file: {said}'):
+                read(str(name))
 
     def test_a_table_may_hold_only_what_ros_can_carry(self):
         @dataclass(frozen=True)

@@ -4,7 +4,6 @@ import os
 import threading
 import time
 from dataclasses import fields, replace
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -25,8 +24,7 @@ from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Level
 from anser_ros.pose_states import REFERENCES_LOST, code_of
 from anser_ros.refit import tables
-from anser_ros.sessions import kept_tables
-from anser_ros.sessions.kept_tables import MOST_TABLES, KeptTables, ReadAhead
+from anser_ros.sessions.kept_tables import MOST_TABLES, KeptTables
 from anser_ros.sessions.nominal_board import NominalBoard, stated_volume
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.starting_model import load_model, save_model
@@ -201,22 +199,12 @@ def test_tables_are_read_as_they_were_written(tmp_path):
     assert KeptTables(tmp_path, setup, stronger, world.references).read() is None
 
     (path,) = tmp_path.iterdir()
-    ahead = ReadAhead(tmp_path, world.model)
-    again = KeptTables(tmp_path, setup, world.model, world.references, ahead)
-    with patch.object(kept_tables, 'read_arrays', side_effect=OSError('read twice')):
-        early = again.read()
-        assert again.read() is None, 'what was read early is used once'
-    assert all(same(*pair) for pair in zip(made.factors, early.factors, strict=True))
-    for folder, model in ((None, world.model), (tmp_path, None), (tmp_path, stronger)):
-        assert ReadAhead(folder, model)._read is None, 'nothing is read in vain'
     whole = path.read_bytes()
     middle = bytearray(whole)
     middle[len(whole) // 2] ^= 1
     for damaged in (whole[:-8], bytes(middle), whole[:100], b''):
         path.write_bytes(damaged)
         assert kept.read() is None
-        ahead = ReadAhead(tmp_path, world.model)
-        assert KeptTables(tmp_path, setup, world.model, world.references, ahead).read() is None
     path.unlink()
     for age in range(MOST_TABLES + 2):
         (tmp_path / f'refit_tables_{age}').write_bytes(b'')

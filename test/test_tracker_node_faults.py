@@ -69,7 +69,7 @@ def test_two_publishers_give_no_poses_and_their_models_are_not_obeyed(tracker):
     tracker.peer.destroy_publisher(other)
     tracker.model = mine
     tracker.spin_until(lambda: 'two_sources' not in node.status().message)
-    tracker.spin_until(lambda: node._intake.newest.stamp_ns == 5)
+    tracker.spin_until(lambda: node._given.stamp_ns == 5)
     assert wait(lambda: tracker.poses, lambda: send(second, 1))
 
 

@@ -13,10 +13,10 @@ from anser_ros.errors import ParameterError
 from anser_ros.field.model import FARTHEST_M, FieldModel
 from anser_ros.field.nominal import nominal_model
 from anser_ros.sessions.nominal_board import board_of
-from anser_ros.sessions.starting_model import NOMINAL, load_model, save_model
+from anser_ros.sessions.starting_model import load_model, save_model
 from anser_ros.wire.setup import Setup
 from anser_ros.wire.setup_values import AXIS_TOLERANCE
-from anser_ros.wire.text_files import path_of
+from anser_ros.wire.text_files import NOMINAL, path_of
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,7 @@ from anser_ros.diagnosis.problem import Part, State, tool_parts
 from anser_ros.diagnosis.search import Candidate
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.diagnosis import SessionDiagnosis, diagnose_session, other_way, to_document
-from anser_ros.sessions.session import load_session
-from anser_ros.sessions.starting_model import model_for, save_model
+from anser_ros.sessions.starting_model import save_model
 from anser_ros.settings import SECTIONS, VALUES
 
 USED_ALONE = {*SECTIONS['tools'], *(n for n in SECTIONS['accuracy'] if 'reference' not in n)}
@@ -48,17 +47,9 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
 
 
 def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
-    """Diagnose one session, by the way that its kind needs."""
-    if kind := sessions.named_kind(args):
-        done: output.Result = kind.diagnose(args, tell)
-        return done
-    sessions.need_model(args)
+    """Diagnose one session of fluxes."""
     idle = () if args.baseline else (n for n in VALUES if n not in USED_ALONE)
-    stated = output.stated_values(args, idle, '--baseline')
-    session = load_session(args.session).with_stated(stated)
-    model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)
-    baseline = load_session(args.baseline) if args.baseline else None
-    output.make_folder(args.out)
+    session, model, baseline, notes = sessions.given(args, idle, '--baseline')
     names = {'session': args.session, 'model': args.model}
     if way := other_way(session, baseline):
         other = way.diagnose(session, model, tell)
@@ -74,7 +65,7 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     written = output.write_files(args.out, {'report.html': report, 'diagnosis.json': document})
     return output.Result(
         document,
-        (*sessions.snapshot_notes(args.model, model), *output.loss_notes(session, baseline)),
+        notes,
         (
             output.terminal_table(['held out', 'before', 'after'], held_out_rows(document)),
             verdict(document),

@@ -18,8 +18,7 @@ from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
 from anser_ros.pose_states import OK, RESIDUAL
 from anser_ros.sessions.follower import parse_references, with_references
-from anser_ros.sessions.session import Session, load_session
-from anser_ros.sessions.starting_model import model_for
+from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import (
     Evaluation,
     PoseSeries,
@@ -247,20 +246,13 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
 
 
 def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
-    if kind := sessions.named_kind(args):
-        done: output.Result = kind.evaluate(args, tell)
-        return done
-    sessions.need_model(args)
     for name in ('witnesses', 'references', 'baseline'):
         if getattr(args, name) and not args.refit:
             raise ParameterError(f'--{name} is of a refit; it needs --refit')
-    stated = output.stated_values(args, () if args.refit else SECTIONS['refit'], '--refit')
-    session = load_session(args.session).with_stated(stated)
+    idle = () if args.refit else SECTIONS['refit']
+    session, model, baseline, told = sessions.given(args, idle, '--refit')
     if args.references is not None:
         session = with_references(session, parse_references(args.references))
-    model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)
-    baseline = load_session(args.baseline) if args.baseline else None
-    output.make_folder(args.out)
     evaluation = track_session(
         session, model, TrackerSettings(gate=args.gate), baseline=baseline, refit=args.refit,
         in_phase=args.in_phase, witnesses=args.witnesses,
@@ -280,8 +272,7 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         shown.append(_refit_line(document['refit']))
     strengths = evaluation.strengths
     notes = (
-        *sessions.snapshot_notes(args.model, model),
-        *output.loss_notes(session, baseline),
+        *told,
         *((_few_notes(session) if args.refit else ()) or why),
         *evaluation.disagreements,
         *((f'emitters differ from the model, tools say: {strengths}',) if strengths else ()),

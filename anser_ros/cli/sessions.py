@@ -5,7 +5,7 @@ import csv
 import importlib
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -14,12 +14,13 @@ from rich.table import Table
 
 from anser_ros.cli.commands import SESSION_KINDS
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, EXIT_OK, attempt
-from anser_ros.cli.output import Result, Tell, make_folder, number
+from anser_ros.cli.output import Result, Tell, loss_notes, make_folder, number, stated_values
 from anser_ros.cli.page import Html, escaped, page, paragraph, table, top
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
-from anser_ros.sessions.starting_model import SNAPSHOT, is_snapshot
+from anser_ros.sessions.session import Session, load_session
+from anser_ros.sessions.starting_model import SNAPSHOT, is_snapshot, model_for
 
 
 def add_session_kinds(parser: argparse.ArgumentParser) -> None:
@@ -46,11 +47,23 @@ def named_kind(args: argparse.Namespace) -> ModuleType | None:
     return chosen
 
 
-def need_model(args: argparse.Namespace) -> None:
-    """Raise `ParameterError` where a session of fluxes has no model."""
+def given(
+    args: argparse.Namespace, idle: Iterable[str], option: str
+) -> tuple[Session, FieldModel, Session | None, tuple[str, ...]]:
+    """Load a session, with what is stated of it, its model and its baseline; make the folder.
+
+    Last comes what users have to know of them. Raises `ParameterError` without a model, or where a
+    value is stated that is ``idle`` without an ``option``.
+    """
     if args.model is None:
         kinds = ', '.join(f'--{name}' for name in SESSION_KINDS)
         raise ParameterError(f'the following arguments are required: --model (or {kinds})')
+    session = load_session(args.session).with_stated(stated_values(args, idle, option))
+    model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)
+    baseline = load_session(args.baseline) if args.baseline else None
+    make_folder(args.out)
+    notes = *snapshot_notes(args.model, model), *loss_notes(session, baseline)
+    return session, model, baseline, notes
 
 
 def snapshot_notes(name: str, model: FieldModel) -> tuple[str, ...]:
@@ -254,6 +267,8 @@ def on_each(command: str, work: Work, args: argparse.Namespace, tell: Tell) -> R
 
     Of several each has a folder of its own, whatever comes of the others, and a row in a summary.
     """
+    if kind := named_kind(args):
+        work = getattr(kind, command)
     if len(args.sessions) == 1:
         args.session = args.sessions[0]
         return work(args, tell)

@@ -21,7 +21,7 @@ from anser_ros.nodes import acquisition_status
 from anser_ros.nodes.acquisition_stream import FluxFrame, FluxStream, MeasuredAccuracy, WallClock
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import parameter, prefix_parameter
+from anser_ros.nodes.runtime.parameters import from_text, parameter, prefix_parameter
 from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.streams.clouds import flux_cloud, readings_of
 from anser_ros.nodes.streams.one_source import Backlog, too_slow
@@ -49,7 +49,6 @@ from anser_ros.wire.port import (
 )
 from anser_ros.wire.protocols import PROTOCOLS, StreamControl
 from anser_ros.wire.setup import Setup, dump_setup, parse_setup
-from anser_ros.wire.text_files import read_config
 
 if TYPE_CHECKING:
     from anser_ros.chain.chain import Chain
@@ -111,9 +110,9 @@ class Acquisition(AnserNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         table = self.parameters
-        self._setup = parse_setup(read_config(table.setup_file))
+        self._setup = from_text('setup_file', table.setup_file, parse_setup)
         self._frame_id = f'{table.frame_prefix}{self._setup.frame_id}'
-        self._calibration = parse_channels(read_config(table.channels_file))
+        self._calibration = from_text('channels_file', table.channels_file, parse_channels)
         self._setup_publisher = self.create_publisher(String, 'setup', qos.LATCHED)
         self._tool_publisher = self.create_publisher(PointCloud2, 'tool/flux', qos.STREAM)
         self._reference_publisher = self.create_publisher(
@@ -359,8 +358,8 @@ class Acquisition(AnserNode):
 
     def _log_change(self, level: Level, message: str) -> None:
         """Write on the console when an error begins, and when all is well (again)."""
-        if level is self._logged or level not in (Level.OK, Level.ERROR):
-            return
+        if level is self._logged or level not in (Level.OK, Level.ERROR) or self._closing.is_set():
+            return  # at the end the unit may have gone before
         self._logged = level
         device = self.parameters.device if self._port is None else self._port.device
         if level is Level.OK:

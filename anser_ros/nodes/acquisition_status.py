@@ -7,7 +7,7 @@ import numpy as np
 
 from anser_ros.nodes.acquisition_stream import FluxFrame, FluxStream, Staleness
 from anser_ros.nodes.runtime.diagnostics import Level, Status, named
-from anser_ros.signals.clock import ClockState
+from anser_ros.signals.clock import LARGEST_LATENESS_S, ClockState
 from anser_ros.wire.frames import DeviceStatus, StatusFlag
 from anser_ros.wire.points import DROPPED, SATURATED, STALE
 from anser_ros.wire.setup import Coil
@@ -158,7 +158,7 @@ def _why_stale(staleness: Staleness | None, row: int) -> str:
 def clock_troubles(stream: FluxStream) -> list[tuple[Level, str]]:
     """Return what is wrong with the stamps, and with the device's own clock."""
     clock, found = stream.clock, []
-    if clock.state is ClockState.LATE and clock.is_doubted:
+    if clock.is_doubted and clock.lateness_s > LARGEST_LATENESS_S:
         words = f'clock: everything arrives {clock.lateness_s:.2g} s late'
         found.append((Level.WARN, words))
     elif clock.state is ClockState.SETTLING and stream.withheld:

@@ -19,7 +19,12 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes.pose_output import PackedMessage
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import optical_parameter, parameter, prefix_parameter
+from anser_ros.nodes.runtime.parameters import (
+    from_text,
+    optical_parameter,
+    parameter,
+    prefix_parameter,
+)
 from anser_ros.nodes.runtime.process import main
 from anser_ros.physics.rotations import quaternion_of_rotation
 from anser_ros.simulation import line, world
@@ -29,7 +34,6 @@ from anser_ros.simulation.effects import Drawn, draw
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.recorded import optical_topic
 from anser_ros.wire.setup import parse_setup
-from anser_ros.wire.text_files import read_config
 
 STRETCH_S = 0.005
 """Stretch of samples that is made at a time, s: it bounds how unevenly they are sent."""
@@ -105,8 +109,8 @@ class CuSimulator(AnserNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         table = self.parameters
-        setup = parse_setup(read_config(table.setup_file))
-        channels = parse_channels(read_config(table.channels_file))
+        setup = from_text('setup_file', table.setup_file, parse_setup)
+        channels = from_text('channels_file', table.channels_file, parse_channels)
         rng = np.random.default_rng(table.effect_seed or None)
         drawn = draw(table.effect, setup, channels, rng)
         if table.effect_file:

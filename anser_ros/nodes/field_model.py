@@ -16,30 +16,29 @@ from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
 from anser_ros.nodes import field_model_io, field_model_refit
-from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import parameter, prefix_parameter
+from anser_ros.nodes.runtime.parameters import from_file, parameter, prefix_parameter
 from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.streams.clouds import GivenModel, read_frame, readings_of
 from anser_ros.nodes.streams.one_source import LOOK_S, NewestSource, sender_words, setup_source
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.frame import MOST_RATE_HZ, Pace, ReadingWindow, check_enough
 from anser_ros.sessions.baseline import board_place_of, clean_flux, clean_mean
-from anser_ros.sessions.kept_tables import ReadAhead, kept_folder
+from anser_ros.sessions.kept_tables import kept_folder
 from anser_ros.sessions.session import load_session, sensor_table
 from anser_ros.sessions.starting_model import (
-    NOMINAL,
     SNAPSHOT,
     as_saved,
     is_nominal,
     is_snapshot,
-    model_of,
+    load_model,
     save_model,
     starting_model,
 )
 from anser_ros.stamps import is_live
 from anser_ros.wire.cdr import PointCloud
 from anser_ros.wire.setup import Setup, parse_setup
+from anser_ros.wire.text_files import NOMINAL
 
 
 @dataclass(frozen=True)
@@ -100,8 +99,8 @@ class FieldModelNode(AnserNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         table = self.parameters
-        self._file_model = model_of(table.model_file)
-        self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
+        self._file_model = from_file('model_file', table.model_file, load_model)
+        self._baseline_bag = from_file('baseline_file', table.baseline_file, load_session)
         if self._baseline_bag is not None and self._baseline_bag.lost:
             self.warn('baseline_damaged', f'{table.baseline_file}: {self._baseline_bag.lost}')
         self._setup_text = self._no_baseline = ''
@@ -113,7 +112,6 @@ class FieldModelNode(AnserNode):
         self._frozen = self._unfit = False
         self._announced: tuple[bool, ...] = ()
         self._place = field_model_io.PlaceWatch()
-        self._trouble = Trouble()
         self._frames: Intake | None = None
         self._stamp_ns, self._received_s = 0, 0.0
         self._output = field_model_io.ModelOutput(self)
@@ -122,13 +120,12 @@ class FieldModelNode(AnserNode):
         self._fluxes = NewestSource(self, 'reference/flux', self._on_flux)
         name = self.get_fully_qualified_name()
         folder = kept_folder(table.keep_state)
-        ahead = ReadAhead(folder, self._file_model if table.refit else None)
         kept = field_model_io.KeptBaseline(folder, name, self._fluxes.sender)
         witnesses = field_model_io.ToolWitnesses(
-            self, table.witnesses, lambda: self._frame_id, self._refuse
+            self, table.witnesses, lambda: self._frame_id, self.refuse
         )
         self._refit = field_model_refit.ActiveRefit(
-            witnesses, Pace(table.refit_rate_hz), self.count, kept, ahead
+            witnesses, Pace(table.refit_rate_hz), self.count, kept
         )
         self.step = self.given(self._take_frame, LONGEST_WAIT_S)
         self.witnessed = self.given(witnesses.note, LONGEST_WAIT_S)
@@ -156,7 +153,7 @@ class FieldModelNode(AnserNode):
                 return  # another rate or noise: model and baseline hold
             base = starting_model(setup, self._file_model)
         except AnserError as error:
-            self._refuse('setups_refused', error)
+            self.refuse('setups_refused', error)
             if isinstance(error, ModelFileError) and self._model is not None:
                 self._unfit = True
                 self._announce_changes()
@@ -191,15 +188,15 @@ class FieldModelNode(AnserNode):
             stamp_ns, points = read_frame(message, self._frame_id, self.count)
             self._take_readings(stamp_ns, readings_of(points))
         except AnserError as error:
-            self._refuse('fluxes_refused', error)
+            self.refuse('fluxes_refused', error)
 
     def _take_frame(self, frame: ChainFrame) -> GivenModel | None:
         """Take a frame of another node of the process, and return the model that now holds."""
         try:
-            if frame.reference is not None and self._fluxes.accepts({}):
+            if frame.reference is not None and not self._fluxes.complaint:
                 self._take_readings(frame.stamp_ns, frame.reference)
         except AnserError as error:
-            self._refuse('fluxes_refused', error)
+            self.refuse('fluxes_refused', error)
         return self._output.newest
 
     def _take_readings(self, stamp_ns: int, readings: FrameReadings) -> None:
@@ -300,7 +297,7 @@ class FieldModelNode(AnserNode):
 
     def _refuse_baseline(self, error: AnserError) -> None:
         self._no_baseline = str(error)
-        self._refuse('baselines_refused', error)
+        self.refuse('baselines_refused', error)
 
     def _look(self) -> None:
         """Notice what changes without a frame."""
@@ -406,14 +403,10 @@ class FieldModelNode(AnserNode):
 
     # What is reported -------------------------------------------------------------------------
 
-    def _refuse(self, counter: str, error: AnserError) -> None:
-        self._trouble.say(str(error), time.monotonic())
-        self.warn(counter, str(error))
-
     def on_parameters(self, old: FieldModelParameters, new: FieldModelParameters) -> None:
         """Go on with the new model, at the new rate, or no longer."""
         if old.model_file != new.model_file:
-            self._exchange(model_of(new.model_file))
+            self._exchange(from_file('model_file', new.model_file, load_model))
         self._refit.pace.rate_hz = new.refit_rate_hz
         self._announce_changes()
 

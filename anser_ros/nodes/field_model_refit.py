@@ -28,7 +28,7 @@ from anser_ros.refit.frame import Pace
 from anser_ros.refit.health import DISAGREES
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.model import WITHHELD, RefitResult
-from anser_ros.sessions.kept_tables import KeptTables, ReadAhead
+from anser_ros.sessions.kept_tables import KeptTables
 from anser_ros.sessions.nominal_board import NominalBoard, stated_volume
 from anser_ros.stamps import is_live
 from anser_ros.wire.setup import Setup
@@ -45,7 +45,7 @@ class RefitStart:
     """Makes the refits of one model in a thread of its own.
 
     An emitter that can't be drawn from the setup has to do with the model's own dipoles. Tables
-    are kept in a ``folder``, which ``ahead`` belongs to; None where they are not. With tools as
+    are kept in a ``folder``; None where they are not. With tools as
     witnesses, ``witness_noise_t`` is the noise of a component of what they read, T.
     """
 
@@ -55,11 +55,10 @@ class RefitStart:
         model: FieldModel,
         references: SensorTable,
         folder: Path | None = None,
-        ahead: ReadAhead | None = None,
         witness_noise_t: float | None = None,
     ) -> None:
         self._setup, self._model, self._references = setup, model, references
-        self._folder, self._ahead, self._witness_noise_t = folder, ahead, witness_noise_t
+        self._folder, self._witness_noise_t = folder, witness_noise_t
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=WORKER)
         self._tables: Future[tables.RefitTables] | None = None
         self._made: Future[LiveRefit] | None = None
@@ -117,7 +116,7 @@ class RefitStart:
         return not wait(going_on, longest_s).not_done
 
     def _file(self, folder: Path) -> KeptTables:
-        return KeptTables(folder, self._setup, self._model, self._references, self._ahead)
+        return KeptTables(folder, self._setup, self._model, self._references)
 
     def _work_tables_out(self) -> tables.RefitTables:
         kept = None if self._folder is None else self._file(self._folder).read()
@@ -150,9 +149,9 @@ class RefitStart:
 class ActiveRefit(ModelHalf):
     """Keeps the refit, its last result, and what it is made from.
 
-    ``count`` counts an event by its name, ``kept`` is what a process after this one takes up, and
-    ``ahead`` what is read of it before references and setup are known. ``start`` makes the refits
-    of the active model, None without references; the newest ``result`` took ``update_s``.
+    ``count`` counts an event by its name, ``kept`` is what a process after this one takes up.
+    ``start`` makes the refits of the active model, None without references; the newest ``result``
+    took ``update_s``.
     """
 
     def __init__(
@@ -161,13 +160,12 @@ class ActiveRefit(ModelHalf):
         pace: Pace,
         count: Callable[[str], None],
         kept: KeptBaseline,
-        ahead: ReadAhead,
     ) -> None:
         super().__init__(pace)
         # The compiler loads for half a second, now, while the graph is still being discovered.
         loop_field(np.eye(3), np.ones((1, 3)), 1.0)
         self._witnesses, self._count = witnesses, count
-        self._kept, self._ahead = kept, ahead
+        self._kept = kept
         self._has_looked = False
         self._confirmed: RefitResult | None = None
         self.start: RefitStart | None = None
@@ -188,11 +186,9 @@ class ActiveRefit(ModelHalf):
         self._witnesses.expect(setup, base)
         if len(references):
             folder, noise_t = self._kept.folder, self._witnesses.noise_t
-            self.start = RefitStart(setup, base, references, folder, self._ahead, noise_t)
+            self.start = RefitStart(setup, base, references, folder, noise_t)
             if at_once:
                 self.start.prepare()
-        else:
-            self._ahead.drop()
         baseline, self._baseline = self._baseline, None
         if again and baseline is not None:
             self.begin(baseline)

@@ -4,6 +4,7 @@ import math
 import struct
 import time
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from yaml import YAMLError
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Level, Status
+from anser_ros.nodes.runtime.parameters import from_file
 from anser_ros.physics.rotations import (
     quaternion_of_axis,
     quaternion_of_rotation,
@@ -167,23 +169,27 @@ def board_pose_of(table: Any) -> tuple[float, ...]:
     A file of ``anser handeye`` has the way from the other tracker's frame to the board's. Raises
     `ParameterError` when a pose is no pose, or is missing where there is a parent frame.
     """
-    path: str = table.registration_file
-    numbers: tuple[float, ...] = table.board_pose
-    try:
-        if path:
-            found = read_yaml(read_text(path))
-            if 'board_pose' in found:
-                numbers = tuple(map(float, found['board_pose']))
-            else:
-                turn = rotation_of_quaternion(np.array(found['registration_quaternion_xyzw'])).T
-                place = -turn @ np.array(found['registration_translation_m'], dtype=float)
-                numbers = *place.tolist(), *quaternion_of_rotation(turn)
-    except (KeyError, TypeError, ValueError, YAMLError) as error:
-        raise ParameterError(f'parameter registration_file: {path}: no pose ({error})') from error
+    stated: tuple[float, ...] = table.board_pose
+    numbers: tuple[float, ...] = from_file(
+        'registration_file', table.registration_file, _registration, stated
+    )
     is_pose = len(numbers) == 7 and bool(np.isfinite(unit_quaternions(numbers[3:])).all())
     if not (is_pose and np.isfinite(numbers).all()) and (numbers or table.parent_frame):
         raise ParameterError(f'parameter board_pose: x y z qx qy qz qw needed, got {numbers}')
     return numbers
+
+
+def _registration(path: Path) -> tuple[float, ...]:
+    """The board's pose of a file; raises `ParameterError` when it has none."""
+    try:
+        found = read_yaml(read_text(path))
+        if 'board_pose' in found:
+            return tuple(map(float, found['board_pose']))
+        turn = rotation_of_quaternion(np.array(found['registration_quaternion_xyzw'])).T
+        place = -turn @ np.array(found['registration_translation_m'], dtype=float)
+    except (KeyError, TypeError, ValueError, YAMLError) as error:
+        raise ParameterError(f'{path}: no pose ({error})') from error
+    return *place.tolist(), *quaternion_of_rotation(turn)
 
 
 def state_board(node: Any, publisher: Any, table: Any) -> Any:

@@ -16,7 +16,8 @@ import numpy as np
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
-from anser_ros.chain.frame import AnsweredFrames, FrameReadings
+from anser_ros.chain.chain import AnsweredFrames
+from anser_ros.chain.frame import ChainFrame, FrameReadings
 from anser_ros.chain.tracking_half import TrackingHalf
 from anser_ros.errors import AnserError
 from anser_ros.field.model import FieldModel
@@ -28,10 +29,11 @@ from anser_ros.nodes.pose_output import (
     transform_publisher,
 )  # fmt: skip
 from anser_ros.nodes.runtime import qos
-from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import (
     STALE_AFTER_S,
+    from_file,
+    from_text,
     parameter,
     prefix_parameter,
 )  # fmt: skip
@@ -41,14 +43,13 @@ from anser_ros.nodes.streams.clouds import GivenModel, read_frame, readings_of
 from anser_ros.nodes.tracker_models import ModelIntake, ModelReader
 from anser_ros.pose_states import OK, TWO_SOURCES, Withheld
 from anser_ros.sessions.session import sensor_table, settings_for
-from anser_ros.sessions.starting_model import check_emitters, model_of
+from anser_ros.sessions.starting_model import check_emitters, load_model
 from anser_ros.stamps import SECOND_NS, is_live
 from anser_ros.tracking.estimate import NO_GATE, USUAL_GATE, PoseEstimate, Tip, TrackerSettings
 from anser_ros.tracking.tracker import Tracker, warm_up
 from anser_ros.wire.cdr import PointCloud
 from anser_ros.wire.setup import Setup, parse_setup
-from anser_ros.wire.setup_values import TipSpec, read_tips, tip_name
-from anser_ros.wire.text_files import read_text
+from anser_ros.wire.setup_values import read_tips, tip_name
 
 
 @dataclass(frozen=True)
@@ -114,17 +115,6 @@ def settings_of(table: TrackerParameters) -> TrackerSettings:
     return TrackerSettings(adaptive=table.adaptive, gate=table.gate, max_sigma_m=table.max_sigma_m)
 
 
-def tips_of_file(path: str) -> dict[str, TipSpec]:
-    """Return tips of a file by body; none where no file is named.
-
-    Raises `ParameterError` when it can't be read, and `SetupError` when it has no tips.
-    """
-    try:
-        return read_tips(read_text(path)) if path else {}
-    except AnserError as error:
-        raise type(error)(f'parameter tips_file: {error}') from error
-
-
 EARLIEST_DIAGNOSTICS_S = 0.1
 """Least time between two messages in /diagnostics that a changed state asks for, s: a state that
 flickers from frame to frame must not flood the topic."""
@@ -150,8 +140,8 @@ class TrackerNode(AnserNode):
         super().__init__(**options)
         table = self.parameters
         self._settings = settings_of(table)
-        self._file_model = model_of(table.model_file)
-        self._file_tips = tips_of_file(table.tips_file)
+        self._file_model = from_file('model_file', table.model_file, load_model)
+        self._file_tips = from_text('tips_file', table.tips_file, read_tips, {})
         self._tips: dict[str, Tip] = {}
         self._setup_text = ''
         self._setup: Setup | None = None
@@ -160,10 +150,8 @@ class TrackerNode(AnserNode):
         self._topics: dict[str, PoseTopic] = {}
         self._intake = ModelIntake()
         self._given: GivenModel | None = None
-        self._frames = AnsweredFrames(self._use_answer, self._track)
-        self._is_live = False
-        self.use, self.step = self.given(self._take_given), self.given(self._take_frame)
-        self._trouble = Trouble()
+        self.use, self.step = self.given(self._use_model), self.given(self._track)
+        self._frames = AnsweredFrames(self)
         self._solve_s = self._diagnosed_s = 0.0
         self._counted = 0, 0
         self._model_age_ns = 0
@@ -207,7 +195,7 @@ class TrackerNode(AnserNode):
             if self._file_model is not None:
                 check_emitters(setup, self._file_model)
         except AnserError as error:
-            self._refuse('setups_refused', error)
+            self.refuse('setups_refused', error)
             return
         self._setup_text, self._setup = message.data, setup
         self._begin(setup, tracker)
@@ -241,25 +229,11 @@ class TrackerNode(AnserNode):
         try:
             given = take(message)
         except AnserError as error:
-            self._refuse('models_refused', error)
+            self.refuse('models_refused', error)
             return
         if given is not None:
             self._frames.follows = given.follows
-            self._frames.add_model(given.stamp_ns, given, time.monotonic())
-
-    def _take_given(self, given: GivenModel, ahead: bool) -> None:
-        """Track with a model that another node of the process made."""
-        if self._models.accepts({}):
-            self._intake.newest = given
-            self._use_model(given, ahead)
-
-    def _take_frame(self, stamp_ns: int, tools: FrameReadings) -> list[PoseEstimate]:
-        """Track a frame of another node of the process, and return what is found."""
-        if self._setup is None:
-            self.count('fluxes_before_setup')
-            return []
-        self._fluxes.accepts({})
-        return self._track((stamp_ns, tools))
+            self._frames.add_answer(given, time.monotonic())
 
     def _begin(self, setup: Setup, tracker: Tracker) -> None:
         """Track the tools of a setup with the tracker's own model, until another one is used."""
@@ -268,7 +242,10 @@ class TrackerNode(AnserNode):
         self._half = TrackingHalf(tracker, setup.refit.references_age_s, self._reader.own)
 
     def _use_model(self, given: GivenModel | None = None, ahead: bool = False) -> None:
-        """Use a model, else the last one or the tracker's own, once the setup is known too."""
+        """Use a model, else the last one or the tracker's own, once the setup is known too.
+
+        One that is ``ahead`` is for the frame after its own.
+        """
         half, reader = self._half, self._reader
         self._given = given = given or self._given
         if half is None or reader is None:
@@ -280,24 +257,29 @@ class TrackerNode(AnserNode):
                 half.use(answer, ahead)
                 self.count('models', answer.model is not before)
         except AnserError as error:
-            self._refuse('models_refused', error)
-
-    def _use_answer(self, given: GivenModel) -> None:
-        """Use a model for its own frame or, of what is live, for the one after it."""
-        self._use_model(given, self._is_live)
+            self.refuse('models_refused', error)
 
     def _on_flux(self, message: PointCloud, is_doubted: bool = False) -> None:
         """Track a frame when its model is there, or after so long; say at once of one that may be
         another sender's why it has no poses.
         """
-        frame = self._read(message)
-        if frame is not None and is_doubted:
-            self._track(frame)
-        elif frame is not None:
-            wait_s, self._is_live = self.parameters.model_wait_s, is_live(frame[0], time.time_ns())
-            self._frames.add_frame(frame[0], frame, time.monotonic(), wait_s, self._is_live)
-            if self._frames.waiting:
-                self._wait.reset()
+        setup, wait_s = self._setup, self.parameters.model_wait_s
+        if setup is None:
+            self.count('fluxes_before_setup')
+            return
+        try:
+            stamp_ns, points = read_frame(message, setup.frame_id, self.count)
+            frame = ChainFrame(stamp_ns, tools := readings_of(points), None)
+        except AnserError as error:
+            self.refuse('fluxes_refused', error)
+            return
+        if is_doubted:
+            self._track(stamp_ns, tools)
+            return
+        lags = is_live(stamp_ns, time.time_ns())
+        self._frames.add_frame(frame, time.monotonic(), wait_s, lags)
+        if self._frames.waiting:
+            self._wait.reset()
 
     def _lasting(self, message: PointCloud) -> bytes | None:
         """Return what a model says until there is another; None while each frame has its own."""
@@ -309,33 +291,20 @@ class TrackerNode(AnserNode):
         if not self._frames.waiting:
             self._wait.cancel()
 
-    def _read(self, message: PointCloud) -> tuple[int, FrameReadings] | None:
-        """Stamp and readings of a frame that can be tracked, or None for one that is refused."""
-        setup = self._setup
-        if setup is None:
-            self.count('fluxes_before_setup')
-            return None
-        try:
-            stamp_ns, points = read_frame(message, setup.frame_id, self.count)
-            return stamp_ns, readings_of(points)
-        except AnserError as error:
-            self._refuse('fluxes_refused', error)
-            return None
-
-    def _track(self, frame: tuple[int, FrameReadings]) -> list[PoseEstimate]:
+    def _track(self, stamp_ns: int, tools: FrameReadings) -> list[PoseEstimate]:
         """Track a frame with the active model, publish what is good, and return what is found."""
-        half = self._half
+        half, begin_s = self._half, time.perf_counter()
         if half is None:
+            self.count('fluxes_before_setup')
             return []
-        begin_s, (stamp_ns, readings) = time.perf_counter(), frame
         conflict = one_source.sender_words(self._sources)
         if half.answer.follows:
             self._model_age_ns = max(self._model_age_ns, stamp_ns - half.answer.stamp_ns)
         try:
             doubt = Withheld(TWO_SOURCES, conflict) if conflict else None
-            found = half.step(stamp_ns, readings, doubt)
+            found = half.step(stamp_ns, tools, doubt)
         except AnserError as error:
-            self._refuse('fluxes_refused', error)
+            self.refuse('fluxes_refused', error)
             return []
         now_ns = self.get_clock().now().nanoseconds
         found += [self._tips[e.name].of_body(e) for e in found if e.name in self._tips]
@@ -363,14 +332,10 @@ class TrackerNode(AnserNode):
 
     # What is reported ---------------------------------------------------------------------
 
-    def _refuse(self, counter: str, error: AnserError) -> None:
-        self._trouble.say(str(error), time.monotonic())
-        self.warn(counter, str(error))
-
     def on_parameters(self, old: TrackerParameters, new: TrackerParameters) -> None:
         """Track on with the new settings or model, from where the tools were."""
         if old.model_file != new.model_file:
-            self._exchange(model_of(new.model_file))
+            self._exchange(from_file('model_file', new.model_file, load_model))
         self._board = state_board(self, self._board, new)
         self._settings = settings_of(new)
         if self._half is not None and self._setup is not None:
@@ -397,7 +362,7 @@ class TrackerNode(AnserNode):
         slow = one_source.too_slow(skipped - before[0], frames - before[1])
         if slow:
             self.warn('seconds_too_slow', slow)
-        half, newest = self._half, self._intake.newest
+        half, newest = self._half, self._intake.newest or self._given
         tracker = None if half is None else half.tracker
         values: dict[str, object] = {
             'frame_time_s': self._solve_s,
@@ -451,9 +416,10 @@ class TrackerNode(AnserNode):
 
         A sender of fluxes (a replay) reads it in ``/diagnostics`` before it starts.
         """
-        half, intake = self._half, self._intake
-        lacks_model = intake.newest is None and self.count_publishers('field_model')
-        lacks_error = not intake.has_error and self.count_publishers('field_model_error')
+        half, given = self._half, self._intake.newest or self._given
+        lacks_model = given is None and self.count_publishers('field_model')
+        lacks_error = given is None or given.error is None
+        lacks_error = lacks_error and self.count_publishers('field_model_error') > 0
         if half is None or half.tracker.model is None or lacks_model or lacks_error:
             return ''
         is_matched = all(topic.is_matched(self) for topic in self._topics.values())

@@ -32,12 +32,6 @@ class ModelIntake:
         # Uncertainties that came before their models, in the order of their arrival.
         self._early: deque[PointCloud] = deque(maxlen=MOST_EARLY)
 
-    @property
-    def has_error(self) -> bool:
-        """Return whether an uncertainty has come."""
-        newest = self.newest
-        return bool(self._early) or (newest is not None and newest.error is not None)
-
     def take(self, message: PointCloud) -> GivenModel:
         """Read a ``field_model`` message.
 

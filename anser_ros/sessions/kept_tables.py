@@ -3,7 +3,6 @@
 import functools
 import os
 from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from anser_ros.sessions.nominal_board import NominalBoard, stated_volume
 from anser_ros.wire.setup import Setup
 
 TABLES = 'refit_tables_'
-"""How the names of files with tables begin; the model's fingerprint follows."""
+"""How the names of files with tables begin."""
 MOST_TABLES = 3
 """Files of tables that are kept, the last used: each has about 140 MB."""
 DAMAGED = (OSError, EOFError, ValueError, KeyError, TypeError, FitError, BadZipFile)
@@ -37,57 +36,26 @@ def kept_folder(is_wanted: bool = True) -> Path | None:
     return Path(base).expanduser() / 'anser_ros'
 
 
-class ReadAhead:
-    """Reads a model's last used tables, for 0.3 s, before references and setup are known."""
-
-    def __init__(self, folder: Path | None, model: FieldModel | None) -> None:
-        self._path: Path | None = None
-        self._read: Future[dict[str, NDArray[Any]]] | None = None
-        if folder is not None and model is not None:
-            kept = folder.glob(f'{_tables_name(model)}*')
-            self._path = max(kept, key=used_s, default=None)
-        if self._path is not None:
-            worker = ThreadPoolExecutor(1, thread_name_prefix='read_ahead')
-            self._read = worker.submit(read_arrays, self._path)
-            worker.shutdown(wait=False)
-
-    def arrays_of(self, path: Path) -> dict[str, NDArray[Any]]:
-        """Return the arrays of a file, which may have been read; raises as `read_arrays`."""
-        read = self._read
-        self.drop()
-        return read_arrays(path) if read is None or path != self._path else read.result()
-
-    def drop(self) -> None:
-        """Forget what was read: it is used once, or not wanted."""
-        self._read = None
-
-
 class KeptTables:
     """Keeps the tables of one model, setup and set of references, which are the tables' own."""
 
     def __init__(
-        self,
-        folder: Path,
-        setup: Setup,
-        model: FieldModel,
-        references: SensorTable,
-        ahead: ReadAhead | None = None,
+        self, folder: Path, setup: Setup, model: FieldModel, references: SensorTable
     ) -> None:
         self._given = setup, model, references
-        self._ahead = ahead or ReadAhead(None, None)
         places = [getattr(references, f.name) for f in fields(references)]
         made_by, stated = [np.__version__, _code()], dict(setup.stated)
         key = fingerprint_of(
             [made_by, setup.identity.board, setup.volume, stated, model.fingerprint, places]
         )
-        self._folder, self._path = folder, folder / f'{_tables_name(model)}{key}'
+        self._folder, self._path = folder, folder / f'{TABLES}{key}'
 
     def read(self) -> RefitTables | None:
         """Return the tables; None where there are none, or the file is damaged."""
         setup, model, references = self._given
         drawing, volume = NominalBoard.of(setup).field, stated_volume(setup)
         try:
-            arrays = self._ahead.arrays_of(self._path)
+            arrays = read_arrays(self._path)
             os.utime(self._path)
             return tables_of(arrays, model, references, setup.refit, drawing, volume)
         except DAMAGED:
@@ -108,11 +76,6 @@ def _code() -> str:
     return fingerprint_of(
         {str(f.relative_to(PACKAGE)): f.read_text('utf-8') for f in PACKAGE.rglob('*.py')}
     )
-
-
-def _tables_name(model: FieldModel) -> str:
-    """Return how the names of all files with tables of a model begin."""
-    return f'{TABLES}{model.fingerprint}_'
 
 
 def used_s(path: Path) -> float:

@@ -15,7 +15,7 @@ from anser_ros.fingerprint import Identity
 from anser_ros.sessions.nominal_board import board_of
 from anser_ros.sessions.session import Session
 from anser_ros.wire.setup import Setup
-from anser_ros.wire.text_files import read_document, write_document
+from anser_ros.wire.text_files import NOMINAL, read_document, write_document
 
 SNAPSHOT = 'snapshot of a refit with metal in force'
 """Source of a model that was saved while it held more than the one it started from."""
@@ -60,15 +60,6 @@ def as_saved(model: FieldModel, base: FieldModel, stamp_ns: int) -> FieldModel:
         'source': SNAPSHOT, 'stamp_ns': stamp_ns, 'started_from': dict(base.provenance)
     }  # fmt: skip
     return replace(model, provenance=provenance)
-
-
-NOMINAL = 'nominal'
-"""Name of the model of the setup's own geometry, given where a model file's path may stand."""
-
-
-def model_of(name: str) -> FieldModel | None:
-    """Return the model of a file, None for no name or the nominal one; raises `ModelFileError`."""
-    return None if name in ('', NOMINAL) else load_model(name)
 
 
 def starting_model(setup: Setup, given: FieldModel | None) -> FieldModel:

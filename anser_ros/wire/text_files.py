@@ -131,10 +131,14 @@ def write_document(path: str | os.PathLike[str], document: Any) -> None:
         raise ModelFileError(f'{name}: {error.strerror}') from error
 
 
+NOMINAL = 'nominal'
+"""Name of the model of the setup's own geometry, given where a model file's path may stand."""
+
+
 def config_path(name: str) -> Path:
     """Return the path of a file: `name` itself, or else in `config/`; raises `SetupError`."""
     given = Path(name).expanduser()
-    if given.is_file():
+    if given.exists():
         return given
     if given.name == name:
         for folder in Path(__file__).resolve().parents:

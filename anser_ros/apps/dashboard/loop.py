@@ -22,7 +22,7 @@ from anser_ros.cli.diagnosis_words import verdict
 from anser_ros.cli.output import make_new_folder
 from anser_ros.errors import AnserError, BagError, ParameterError
 from anser_ros.physics.constants import DEGREES
-from anser_ros.sessions.starting_model import NOMINAL
+from anser_ros.wire.text_files import NOMINAL
 
 if TYPE_CHECKING:  # the loop itself needs no ROS
     from anser_ros.apps.dashboard.nodes.dashboard import ChainClient

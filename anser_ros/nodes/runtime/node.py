@@ -27,7 +27,7 @@ from std_msgs.msg import String
 
 from anser_ros.errors import AnserError, LayoutError, ParameterError
 from anser_ros.nodes.runtime import parameters, qos
-from anser_ros.nodes.runtime.diagnostics import Level, Status, Throttle, diagnostic_array
+from anser_ros.nodes.runtime.diagnostics import Level, Status, Throttle, Trouble, diagnostic_array
 from anser_ros.wire.cdr import read_cloud
 
 MOST_BYTES = {String: 1_000_000, DiagnosticArray: 1_000_000, PointCloud2: 16_000_000}
@@ -97,7 +97,7 @@ class AnserNode(Node):
         self._turn = threading.RLock()
         self.counters: Counter[str] = Counter()
         self.exit_code: int | None = None
-        self._throttle = Throttle(WARNING_PERIOD_S)
+        self._throttle, self._trouble = Throttle(WARNING_PERIOD_S), Trouble()
         self._fault: str | None = None
         self._faults_reported = 0
         self._has_checked = False
@@ -160,6 +160,11 @@ class AnserNode(Node):
         admitted = self._throttle.admit(kind, text, time.monotonic())
         if admitted is not None:
             self.get_logger().warning(admitted)
+
+    def refuse(self, counter: str, error: AnserError) -> None:
+        """Count and log an input that is refused; why is the node's latest trouble."""
+        self._trouble.say(str(error), time.monotonic())
+        self.warn(counter, str(error))
 
     def stop(self, code: int = 0) -> None:
         """End the process after the running callback."""

@@ -11,14 +11,15 @@ import itertools
 import math
 import re
 import typing
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import yaml
 
-from anser_ros.errors import ParameterError
+from anser_ros.errors import AnserError, ParameterError
 from anser_ros.wire.recorded import OPTICAL, TRACKED
-from anser_ros.wire.text_files import config_path, read_config, read_text, read_yaml
+from anser_ros.wire.text_files import NOMINAL, config_path, read_config, read_text, read_yaml
 
 LIST_ITEMS = {tuple[float, ...]: float, tuple[int, ...]: int, tuple[str, ...]: str}
 SCALARS = (bool, int, float, str)
@@ -154,6 +155,24 @@ def tracked_parameter() -> Any:
     )
 
 
+def from_file(name: str, given: str, read: Callable[[Path], Any], none: Any = None) -> Any:
+    """Return what a file holds that a parameter gives, by a path or its name in `config/`.
+
+    It is ``none`` where no file is given. An error of the file states the parameter.
+    """
+    try:
+        return none if given in NO_FILE else read(config_path(given))
+    except AnserError as error:
+        raise type(error)(f'parameter {name}: {error}') from error
+
+
+def from_text(name: str, given: str, parse: Callable[[str], Any], none: Any = None) -> Any:
+    """Return what the text of a file says, found as `from_file` does."""
+    return from_file(name, given, lambda path: parse(read_text(path)), none)
+
+
+NO_FILE = '', NOMINAL
+"""Values of parameters of files that name none."""
 LEAF = 'ros__parameters'
 WILDCARDS = ('*', '**')
 

@@ -130,6 +130,8 @@ class OneSource:
         self._publishers, self._looked_s = 0, 0.0
         self._refused_s: float | None = None
         self.subscription = self._subscribed()
+        if self.subscription is None:  # nodes of this process give it as objects, without numbers
+            self._sources.take(None, 0, 0.0)
 
     @property
     def complaint(self) -> str:
@@ -162,9 +164,7 @@ class OneSource:
         return bytes(known[0].endpoint_gid).hex() if len(known) == 1 else ''
 
     def accepts(self, info: Mapping[str, Any], lasting: Hashable = None) -> bool:
-        """Take a message's information, empty where a node of this process gave it as an object;
-        return whether the message may be used.
-        """
+        """Take a message's information; return whether the message may be used."""
         now_s, number = time.monotonic(), info.get(NUMBER)
         if number is not None and not self._sources.continues(number):
             self._looked_s = 0.0  # the graph as it is at this moment is needed

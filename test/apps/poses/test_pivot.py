@@ -3,6 +3,7 @@
 import json
 import threading
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,10 @@ from scipy.spatial.transform import Rotation
 from anser_ros.apps.poses.assessment.pivot import PivotLimits, fit_pivot
 from anser_ros.apps.poses.sequence import sequence_of
 from anser_ros.cli.main import run_verb
-from anser_ros.errors import FitError, ParameterError, SetupError
-from anser_ros.nodes import tracker
+from anser_ros.errors import FitError, SetupError
 from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.parameters import from_text
+from anser_ros.nodes.tracker import TrackerParameters
 from anser_ros.pose_states import OK
 from anser_ros.tracking.estimate import PoseEstimate, Tip, no_pose
 from anser_ros.wire.setup import dump_setup, parse_setup
@@ -225,9 +227,10 @@ def test_positions_in_millimetres_are_named_and_what_is_no_pose_is_counted(tmp_p
 
 
 def test_a_file_of_tips_that_is_not_there_is_the_callers_fault(tmp_path):
-    with pytest.raises(ParameterError, match='tips_file'):
-        tracker.tips_of_file(str(tmp_path / 'none.yaml'))
-    assert tracker.tips_of_file('') == {}
+    tips_of = partial(from_text, 'tips_file', parse=read_tips, none={})
+    with pytest.raises(SetupError, match='tips_file'):
+        tips_of(str(tmp_path / 'none.yaml'))
+    assert tips_of(TrackerParameters.tips_file) == {}
 
 
 def test_the_command_takes_poses_from_the_graph(ros, tmp_path, capsys):

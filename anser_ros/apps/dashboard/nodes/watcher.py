@@ -26,18 +26,19 @@ from anser_ros.nodes.operator_words import (
 )
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
-from anser_ros.nodes.runtime.parameters import optical_parameter, parameter
+from anser_ros.nodes.runtime.parameters import from_file, optical_parameter, parameter
 from anser_ros.nodes.runtime.process import main
 from anser_ros.nodes.streams.clouds import read_frame
 from anser_ros.nodes.streams.one_source import OneSource, sender_words, setup_source
 from anser_ros.pose_states import TWO_SOURCES
 from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import empty_session, load_session
-from anser_ros.sessions.starting_model import NOMINAL, load_model, model_for
+from anser_ros.sessions.starting_model import load_model, model_for
 from anser_ros.stamps import stamp_of
 from anser_ros.wire.cdr import PointCloud
 from anser_ros.wire.recorded import optical_topic, pose_numbers
 from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.text_files import NOMINAL
 
 POLL_S = 0.2
 """How often it is asked whether a look is due, s: far less than the time between looks."""
@@ -107,9 +108,8 @@ class FluxStreams:
 
     def __init__(self, node: 'Watcher', table: WatcherParameters) -> None:
         self._node = node
-        if table.model_file != NOMINAL:
-            load_model(table.model_file)  # refused now, not when fluxes come
-        self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
+        from_file('model_file', table.model_file, load_model)  # refused now, not when fluxes come
+        self._baseline_bag = from_file('baseline_file', table.baseline_file, load_session)
         self._setup_text = self._offered = ''
         self.window: SlidingWindow | None = None
         self.watch: Watch | None = None
@@ -139,9 +139,10 @@ class FluxStreams:
         Raises `AnserError` when the text is not a setup, or model or baseline do not fit it.
         """
         setup, table = parse_setup(text), self._node.parameters
+        name = from_file('model_file', table.model_file, str, NOMINAL)
         # An empty window has a session's setup already, and a model must fit that.
         empty = empty_session(setup, LIVE)
-        prepared = prepare(empty, model_for(table.model_file, empty), self._baseline_bag)
+        prepared = prepare(empty, model_for(name, empty), self._baseline_bag)
         self._setup_text = text
         self.window = SlidingWindow(setup, table.window_s, table.frames)
         self.watch = Watch(prepared)
@@ -220,7 +221,6 @@ class Watcher(AnserNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._seen: Any = None
-        self._trouble = ''
         self._known: dict[str, EffectRecord] = {}
         self._next_s = self._look_s = 0.0
         self._busy = False
@@ -236,13 +236,10 @@ class Watcher(AnserNode):
         self._thread = threading.Thread(target=self._work, args=(work,), daemon=True)
         self._thread.start()
 
-    def refuse(self, counter: str, error: AnserError) -> None:
-        self._trouble = str(error)
-        self.warn(counter, str(error))
-
     def forget(self) -> None:
         """Forget what was found: something else is watched from now on."""
-        self._trouble, self._seen, self._known = '', None, {}
+        self._trouble.forget()
+        self._seen, self._known = None, {}
 
     def on_parameters(self, old: WatcherParameters, new: WatcherParameters) -> None:
         self._streams.on_parameters(old, new)
@@ -280,7 +277,8 @@ class Watcher(AnserNode):
             self._seen = None
             return
         if watch is self._streams.watch:
-            self._trouble, self._seen = '', seen
+            self._trouble.forget()
+            self._seen = seen
             self._known |= {title_of(record): record for record in seen.findings}
 
     def close(self) -> None:
@@ -293,12 +291,15 @@ class Watcher(AnserNode):
 
     def status(self) -> Status:
         streams, seen = self._streams, self._seen
-        values: dict[str, object] = {'look_cpu_s': self._look_s, 'last_refusal': self._trouble}
+        values: dict[str, object] = {
+            'look_cpu_s': self._look_s,
+            'last_refusal': self._trouble.last,
+        }
         conflict = sender_words(streams.sources)
         if conflict:
             return Status('', Level.ERROR, f'{TWO_SOURCES}: {conflict}', values)
         if streams.window is None or streams.watch is None:
-            return Status('', Level.WARN, self._trouble or 'no setup yet', values)
+            return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         values |= {'searches': streams.watch.searches, 'restarts': streams.window.restarts}
         if self._is_silent(time.monotonic()):
             return Status('', Level.WARN, f'no {streams.WHAT}', values)
@@ -307,7 +308,7 @@ class Watcher(AnserNode):
             return Status('', Level.WARN, f'no {streams.WHAT} on {", ".join(quiet)}', values)
         if seen is None:
             state = f'collecting data, {streams.window.span_s:.0f} s so far'
-            return Status('', Level.OK, self._trouble or state, values)
+            return Status('', Level.OK, self._trouble.last or state, values)
         level = Level.OK if seen.is_clear else Level.WARN
         return Status('', level, streams.words(seen), values | streams.values(seen))
 

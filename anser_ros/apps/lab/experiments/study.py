@@ -38,9 +38,10 @@ from anser_ros.physics.constants import MU_0
 from anser_ros.physics.rotations import axis_angles, tangents
 from anser_ros.sessions.calibration import calibrate_sessions, generator_of
 from anser_ros.sessions.session import Session
-from anser_ros.sessions.starting_model import NOMINAL, model_for
+from anser_ros.sessions.starting_model import model_for
 from anser_ros.sessions.tracked_session import error_statistics, track_session
 from anser_ros.simulation.recording import STATIC_NOISE_T
+from anser_ros.wire.text_files import NOMINAL
 
 
 def position_bound(measurements: Measurements, model: FieldModel, noise_t: float) -> Array:
