@@ -13,7 +13,7 @@ from injection_subject import NOISE_T
 from scipy.spatial.transform import Rotation
 
 from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
-from anser_ros.diagnosis.screening import clean_start, outlying_share
+from anser_ros.diagnosis.screening import outlying_share, without_outliers
 from anser_ros.effects.effect import all_effects
 from anser_ros.physics.pose_track import PoseTrack
 
@@ -67,12 +67,13 @@ def test_what_drifts_is_named_with_its_size():
         assert record.parameters[effect.size] == pytest.approx(amount, rel=0.05)
 
 
-def changed(factors: np.ndarray, **spread: float) -> dict:
+def changed(factors: np.ndarray, gaps_t: float = 0.0, **spread: float) -> dict:
     """Records of a tool whose emitters are multiplied by factors (F or 1, K), by their labels."""
     made = world(3, 375, 3)
     made.tool = replace(made.tool, flux=made.tool.flux * factors[:, None])
     problem = replace(made.problem(), references=None)
-    problem = replace(problem, spread=replace(problem.spread, **spread))
+    gaps = tuple(own + gaps_t for own in problem.gaps_t)
+    problem = replace(problem, spread=replace(problem.spread, **spread), gaps_t=gaps)
     found = diagnose(problem, made.model).findings
     return {f.term.label if f.term else f.record.name: f.record.parameters for f in found}
 
@@ -94,6 +95,7 @@ def test_nothing_is_named_that_the_model_may_be_wrong_by():
     gain = np.full((1, 3), 1.001)
     assert set(changed(gain)) == {'common_gain'}
     assert not changed(gain, flux_t=2e-9)
+    assert not changed(gain, gaps_t=2e-9)
 
 
 def test_a_moved_emitter_is_one_fault_where_its_gradient_is_hardly_known():
@@ -128,6 +130,18 @@ def test_a_body_and_a_frame_that_stand_elsewhere_are_named_as_such(quarter):
     np.testing.assert_allclose(np.radians(found['rotation_deg']), [0.03, 0, -0.02], atol=2e-3)
 
 
+def test_a_wrong_pose_that_a_larger_effect_hides_is_no_jitter_of_all_poses():
+    made, moved = world(1, 375, 3), Rotation.from_rotvec([0.03, 0.0, -0.02])
+    track = made.tool.track
+    place = moved.apply(track.position) + [0.002, 0.0, -0.003]
+    place[300] += 0.003
+    made.track(
+        PoseTrack(track.time, place, (moved * Rotation.from_quat(track.quaternion)).as_quat())
+    )
+    [finding] = diagnose(made.problem(), made.model).findings
+    assert finding.record.name == 'registration'
+
+
 CHANNEL, HIT = 2, np.arange(20, 500, 40)
 
 
@@ -160,12 +174,12 @@ def failing(flux):
 @pytest.mark.parametrize('rests', [False, True])
 def test_a_contact_that_fails_is_seen_whether_the_tool_moves_or_rests(rests):
     problem = session(rests, failing)
-    cleaned = clean_start(problem)
+    cleaned = without_outliers(problem)
     assert not cleaned.good[0][HIT, CHANNEL].any()
     assert outlying_share(problem, cleaned)[0] == pytest.approx(HIT.size / 500, abs=0.003)
 
 
 def test_what_a_model_misses_at_a_place_is_no_contact_that_fails():
     moving, resting = session(False, missed), session(True, missed)
-    assert outlying_share(moving, clean_start(moving))[0] > 0.9 * HIT.size / 500
-    assert outlying_share(resting, clean_start(resting)) == (0.0, [])
+    assert outlying_share(moving, without_outliers(moving))[0] > 0.9 * HIT.size / 500
+    assert outlying_share(resting, without_outliers(resting)) == (0.0, [])

@@ -95,10 +95,10 @@ REMNANT = 0.01
 """Further metal with less than this share of the strongest metal's gain is what the model of that
 one left."""
 OWN_METAL = 2.0
-"""Gain of metal at rest, over the power that the model states of its own error in all readings
-(of any other effect 1), below which it may be the model's: what was taken off a scan with metal
-near leaves a field that is metal's, by 2.3 of its stated sigmas in `dirty/scan_metal`, the only
-one tried. Larger hides faint metal (2.0: what moves a tool by 0.03 mm)."""
+"""Gain of metal at rest, over the power that the model states of its own error, everywhere and by
+place, in all readings (of any other effect 1), below which it may be the model's: what was taken
+off a scan with metal near leaves a field that is metal's, 1.1 times that power in
+`dirty/scan_metal`, the only one tried. Larger hides faint metal (what moves a tool by 0.03 mm)."""
 COMPLETE = 3.0
 """Misfit up to which parts that were set up anew explain a session, so that they are its rival to
 metal at rest. They have so many parameters that beside another effect they take off much of what

@@ -97,7 +97,7 @@ def departure(problem: Problem, rest_s: float) -> Departure | None:
         return None
     fitter = Fitter(some, blocks, DEPARTURE_STEPS)
     best = Shaping(fitter, BODY).with_freer_course(min(known, key=Fit.held_out), 0)
-    cleaned = without_outliers(problem, evaluate(problem, best.terms))
+    cleaned = without_outliers(problem, best.terms)
     last = Fitter(cleaned.in_blocks(blocks).thinned(MANY_FRAMES), blocks, DEPARTURE_STEPS)
     fit = last.fit(best.terms)
     unseen = cleaned.in_blocks(test_blocks())

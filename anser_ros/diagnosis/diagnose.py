@@ -5,6 +5,7 @@ First what describes the findings: fitted effects, outliers, noise, and the mode
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from anser_ros.diagnosis.problem import (
     tool_parts,
     train_blocks,
 )
-from anser_ros.diagnosis.search import Progress, Search, SearchSettings, search_effects
+from anser_ros.diagnosis.search import FluxSelection, Progress, Search, SearchSettings
 from anser_ros.diagnosis.wiring import wiring_faults
 from anser_ros.effects.correction import Fields, changed_illumination
 from anser_ros.effects.effect import Family, Remedy, Term
@@ -191,11 +192,14 @@ class Screened:
 
     known: tuple[Term, ...]  # faults of the wiring, which are plain before any search
     whole: Problem  # all frames, without the channels without a signal
-    start: Problem  # the same without values that stand out already now
 
-    def training(self, frames: int) -> Problem:
-        """Return about so many frames per tool of the blocks to choose and fit effects on."""
-        return self.start.in_blocks(train_blocks()).thinned(frames)
+    def training(self, frames: int, terms: Sequence[Term] = ()) -> Problem:
+        """Return about so many frames per tool of the blocks to choose and fit effects on.
+
+        Values that stand out beside some effects take no part.
+        """
+        sound = screening.without_outliers(self.whole, terms)
+        return sound.in_blocks(train_blocks()).thinned(frames)
 
 
 @dataclass(frozen=True)
@@ -228,30 +232,28 @@ def diagnose(
 
 
 def screen(problem: Problem) -> Screened:
-    """Name the faults of the wiring, and leave out dead channels and values that stand out."""
+    """Name the faults of the wiring, and leave out dead channels."""
     known = wiring_faults(problem.thinned(WIRING_FRAMES))
-    whole = _without_dead(problem, known)
-    return Screened(tuple(known), whole, whole if known else screening.clean_start(whole))
+    return Screened(tuple(known), _without_dead(problem, known))
 
 
 def search_screened(
     screened: Screened, how: SearchSettings, progress: Progress | None = None
 ) -> Search:
     """Search for effects on a part of the training blocks' frames."""
-    training = screened.training(SEARCH_FRAMES)
-    return search_effects(training, train_blocks(), screened.known, how, progress)
+    beside = partial(screened.training, SEARCH_FRAMES)
+    selection = FluxSelection(beside, train_blocks(), how, screened.known, progress)
+    selection.search.fit = selection.grown(selection.search.fit)
+    return selection.search
 
 
 def confirm(screened: Screened, search: Search, how: SearchSettings) -> Confirmed:
     """Fit what the search found on more frames, and keep what is the same in all parts."""
-    blocks, whole = train_blocks(), screened.whole
-    last = how.fitter(screened.training(FINAL_FRAMES), blocks)
-    fit, refused = _settled(how.fitter(search.fit.state.problem, blocks), last, search)
-    cleaned = screening.without_outliers(whole, evaluate(whole, fit.terms))
-    if screening.outlying_share(screened.start, cleaned)[0] > decisions.FEWEST_OUTLIERS:
-        thinned = cleaned.in_blocks(blocks).thinned(FINAL_FRAMES)
-        fit = settled(how.fitter(thinned, blocks), fit.terms, FINE)
-    return Confirmed(fit, cleaned, refused)
+    blocks = train_blocks()
+    found, refused = _settled(how.fitter(search.fit.state.problem, blocks), search)
+    last = how.fitter(screened.training(FINAL_FRAMES, found.terms), blocks)
+    fit = settled(last, refit_spreads(last.problem, found.terms), FINE)
+    return Confirmed(fit, screening.without_outliers(screened.whole, fit.terms), refused)
 
 
 def _without_dead(problem: Problem, known: Sequence[Term]) -> Problem:
@@ -267,10 +269,8 @@ def _without_dead(problem: Problem, known: Sequence[Term]) -> Problem:
     return replace(problem, good=good, references=references)
 
 
-def _settled(
-    fitter: Fitter, last: Fitter, search: Search
-) -> tuple[Fit, tuple[tuple[Term, Confirmation], ...]]:
-    """The joint fit, by ``last``, of the effects that are the same in all parts of the data."""
+def _settled(fitter: Fitter, search: Search) -> tuple[Fit, tuple[tuple[Term, Confirmation], ...]]:
+    """The joint fit of the effects that are the same in all parts of the data."""
     fit, refused = search.fit, []
     while bad := doubtful(fitter.problem, fit):
         # Metal that is doubtful costs much to fit again and is hardly ever more than a stand-in.
@@ -283,7 +283,7 @@ def _settled(
         # No curve, no constant: what it went before has a chance, once.
         rest += [p for t in gone if (p := search.passed.pop(t.label, None)) is not None]
         fit = settled(fitter, refit_spreads(fitter.problem, rest))
-    return settled(last, refit_spreads(last.problem, fit.terms), FINE), tuple(refused)
+    return fit, tuple(refused)
 
 
 def conclude(

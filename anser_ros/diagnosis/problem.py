@@ -53,11 +53,6 @@ class Spread:
         return self.accuracy.flux_noise_t
 
     @property
-    def model_share(self) -> float:
-        """Return the share of the square of ``flux_t`` that is the model's own error."""
-        return max(0.0, 1.0 - (self.noise_t / self.flux_t) ** 2)
-
-    @property
     def reference_change(self) -> float:
         """Return the relative error of the change that a reference sees, by the survey's."""
         return REFERENCE_CHANGE * (_survey_share(self.accuracy) / _survey_share(Accuracy()))

@@ -1,5 +1,6 @@
 """Looks at residuals alone: what stands out, what they depend on, what is noise."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,18 +10,18 @@ from scipy.special import chdtrc, chdtri
 from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate, tool_parts
-from anser_ros.effects.effect import Family
+from anser_ros.effects.effect import Family, Term
 
 WINDOW = 11
 """Neighbouring frames whose median an outlier stands out from: up to five bad ones in a row."""
 
 
-def without_outliers(problem: Problem, state: State) -> Problem:
-    """Return the problem without readings and whole frames that stand out in a state of it."""
+def without_outliers(problem: Problem, terms: Sequence[Term] = ()) -> Problem:
+    """Return the problem without readings and whole frames that stand out beside some effects."""
     kept = []
-    moves = any(term.effect.family is Family.FLUCTUATION for term in state.terms)
-    emitters = problem.fields.omega.size
-    for part, tool, good in zip(state.parts, problem.tools, problem.good, strict=False):
+    moves = any(term.effect.family is Family.FLUCTUATION for term in terms)
+    emitters, tools = problem.fields.omega.size, tool_parts(evaluate(problem, terms))
+    for part, tool, good in zip(tools, problem.tools, problem.good, strict=False):
         # The residual along the pose's own directions is left in: an optical glitch shows there.
         size = (part.residual * part.whitener.weight) ** 2
         white = part.white**2
@@ -85,11 +86,6 @@ def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
     ]
 
 
-def clean_start(problem: Problem) -> Problem:
-    """Return the problem without what stands out before anything is explained."""
-    return without_outliers(problem, evaluate(problem, ()))
-
-
 BINS = 12
 """Cells into which frames are binned by one variable, tens of frames in each."""
 BINNED = ('time', 'position', 'orientation', 'speed', 'amplitude')  # by which frames are binned
@@ -148,10 +144,17 @@ def known_variance(state: State) -> float:
     """Return the variance of the tools' residuals that is known of: noise, and what the model
     says that it may be wrong by, which is alike at places close to each other.
     """
-    noise, spread = noise_scale(state) ** 2, state.problem.spread
+    noise = noise_scale(state) ** 2
+    return max(noise, min(noise + model_share(state), 1.0))
+
+
+def model_share(state: State) -> float:
+    """Return the share of the tools' expected power that the model states as its own error,
+    everywhere and by place.
+    """
     weight = np.concatenate([part.whitener.weight.ravel() for part in tool_parts(state)])
-    own = float(np.mean(np.maximum(1.0 - (spread.noise_t * weight[weight > 0]) ** 2, 0.0)))
-    return max(noise, min(noise + own, 1.0))
+    noise = (state.problem.spread.noise_t * weight[weight > 0]) ** 2
+    return float(np.mean(np.maximum(1.0 - noise, 0.0)))
 
 
 def noise_t(state: State) -> float:

@@ -7,7 +7,7 @@ Effects that others have made superfluous are removed (`anser_ros.diagnosis.deci
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
 import numpy as np
@@ -17,6 +17,7 @@ from anser_ros.diagnosis import choice, decisions
 from anser_ros.diagnosis.engine import ForwardSelection, Score, Scorer, is_covered
 from anser_ros.diagnosis.fit import Fit, Fitter, settled
 from anser_ros.diagnosis.problem import Problem, State
+from anser_ros.diagnosis.screening import model_share
 from anser_ros.effects.effect import Family, Term, all_effects
 from anser_ros.parallel import in_order, sharing, slices
 
@@ -64,21 +65,6 @@ class Search:
     metal_gain: float = 0.0  # what the strongest metal took off
 
 
-def search_effects(
-    problem: Problem,
-    blocks: Integers,
-    start: Sequence[Term] = (),
-    settings: SearchSettings | None = None,
-    progress: Progress | None = None,
-) -> Search:
-    """Find the effects that explain a problem on some blocks of time, beside given ones."""
-    how = settings or SearchSettings()
-    fitter = how.fitter(problem, blocks)
-    search = Search(fitter.fit(start))
-    search.fit = _FluxSelection(fitter, search, how, progress).grown(search.fit)
-    return search
-
-
 def is_worthwhile(gain: float, parameters: int, fit: Fit) -> bool:
     """Return whether a gain is worth its parameters, by what this fit leaves."""
     metal = any(term.effect.family.is_metal for term in fit.terms)
@@ -89,26 +75,31 @@ def is_worthwhile(gain: float, parameters: int, fit: Fit) -> bool:
 
 def _may_be_the_model_s(gain: float, fit: Fit) -> bool:
     """Whether an effect explains no more than what the model may have of its own."""
-    own = fit.state.problem.spread.model_share * fit.state.count
+    own = model_share(fit.state) * fit.state.count
     if fit.newest.effect.family is Family.METAL_AT_REST:
         own *= decisions.OWN_METAL * max(fit.misfit, 1.0)
     return gain < own
 
 
-class _FluxSelection(ForwardSelection[Fit]):
-    """Selects the effects of a session of fluxes."""
+class FluxSelection(ForwardSelection[Fit]):
+    """Selects the effects of a session of fluxes.
+
+    ``beside`` returns the problem without what stands out beside some effects.
+    """
 
     def __init__(
-        self, fitter: Fitter, search: Search, how: SearchSettings, progress: Progress | None
-    ) -> None:
-        self._fitter, self._search, self._how = fitter, search, how
+        self, beside: Callable[[Sequence[Term]], Problem], blocks: Integers, how: SearchSettings,
+        start: Sequence[Term], progress: Progress | None,
+    ) -> None:  # fmt: skip
+        self._beside, self._how, self.most = beside, how, how.most_effects
+        self._fitter = how.fitter(beside(start), blocks)
+        self.search = Search(self._fitter.fit(start))
         self._say = progress or (lambda text: None)
-        self.most = how.most_effects
         self._most_metals = decisions.MOST_METALS
 
     def addition(self, fit: Fit) -> Fit | None:
         """Return the fit with one effect more, or None when none pays."""
-        search, scorer = self._search, Scorer(fit.state, self._fitter.blocks)
+        search, scorer = self.search, Scorer(fit.state, self._fitter.blocks)
         fitted = self._fitted(fit, scorer)
         if not fitted:
             return None
@@ -150,7 +141,18 @@ class _FluxSelection(ForwardSelection[Fit]):
     def taken(self, fit: Fit) -> Fit:
         """Return the fit with simpler effects, and fewer, where that is as good."""
         self._say(f'{fit.newest.label}: misfit {fit.misfit:.4g}')
-        return self.thinned(self._simplified(fit))
+        return self.thinned(self._simplified(self._sound(fit)))
+
+    def _sound(self, fit: Fit) -> Fit:
+        """The fit on what does not stand out beside its effects, which had hidden it before.
+
+        One wrong pose would be taken for poses that all jitter.
+        """
+        problem = self._beside(fit.terms)
+        if all(map(np.array_equal, problem.good, self._fitter.problem.good)):
+            return fit
+        self._fitter = replace(self._fitter, problem=problem)
+        return self._fitter.fit(fit.terms)
 
     def is_lost(self, fit: Fit) -> bool:
         """Return whether so many effects are doubtful that something else is the cause."""
@@ -167,7 +169,7 @@ class _FluxSelection(ForwardSelection[Fit]):
             without = settled(self._fitter, [t for t in fit.terms if t is not term])
             gain = without.held_out() - fit.held_out()
             if not is_worthwhile(gain, term.complexity, fit):
-                self._search.removed.append(term)
+                self.search.removed.append(term)
                 return without
         return None
 
@@ -201,7 +203,7 @@ class _FluxSelection(ForwardSelection[Fit]):
 
     def _simplified(self, fit: Fit) -> Fit:
         """Take a simpler effect for an earlier one, which may have absorbed part of the newest."""
-        search = self._search
+        search = self.search
         for term in fit.terms[:-1]:
             if term.effect.family is not Family.STEADY:
                 continue
@@ -245,7 +247,7 @@ class _FluxSelection(ForwardSelection[Fit]):
                 gain = scorer.held_out - fit.held_out() - choice.taken_from_others(fit)
                 fitted.append((gain, fit))
                 table.append(Candidate(fit.newest, term.complexity, gain, gain))
-        self._search.rounds.append(sorted(table, key=lambda c: -c.gain))
+        self.search.rounds.append(sorted(table, key=lambda c: -c.gain))
         return fitted
 
     def _others(self, scorer: Scorer[State]) -> list[tuple[Term, Score]]:
