@@ -127,6 +127,21 @@ class TestWriteSession:
         np.testing.assert_allclose(tool.time, times - times[0], atol=1e-9)
         np.testing.assert_allclose(tool.position, given[1], atol=1e-12)
         assert tool.valid[:, 0].tolist() == [True, True, False, True]
+        assert session.lost == 'fluxes of pen are missing or not finite in 1 of 4 frames, left out'
+
+    def test_a_setup_of_numpy_s_numbers_is_one_of_python_s(self, tmp_path):
+        setup = {**SETUP, 'flux_rate_hz': np.float64(50.0)}
+        setup['sensors'] = tuple(
+            {**one, 'channel': np.int64(one['channel']), 'axis': np.array(one['axis'])}
+            for one in SETUP['sensors']
+        )
+        write_session(
+            tmp_path / 'a.mcap', setup, np.arange(3), np.zeros((3, 2, 2)) + 1e-6,
+            start_ns=np.int64(10**18),
+        )  # fmt: skip
+        assert load_session(tmp_path / 'a.mcap').setup == load_setup(SETUP)
+        with pytest.raises(SetupError, match='text, numbers'):
+            load_setup({**SETUP, 'flux_rate_hz': object()})
 
     def test_refusals(self, tmp_path):
         path, times, flux = tmp_path / 'a.mcap', np.arange(3), np.zeros((3, 2, 2))

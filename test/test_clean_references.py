@@ -79,6 +79,9 @@ def test_metal_that_moves_is_seen_whenever_it_is_there(rng):
             check_steady(recorded(world, rng, SIGMA_T, metal, [when]))
         assert check_steady(recorded(world, rng, 1e-7, metal, [when]))  # lost in noise
     assert check_steady(recorded(world, rng, SIGMA_T)[:11]) is None
+    lossy = recorded(world, rng, SIGMA_T)
+    lossy[2:4] = np.nan  # windows that were lost
+    assert check_steady(lossy) == pytest.approx(sigma, rel=0.3)
 
 
 @pytest.mark.parametrize('world', [anser_world(), three_coil_world()])

@@ -11,7 +11,7 @@ from conftest import REPO
 from scipy.spatial.transform import Rotation
 
 from anser_ros.cli.main import main
-from anser_ros.errors import DiagnosisError, PlausibilityError
+from anser_ros.errors import DiagnosisError, ModelFileError, PlausibilityError
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.sessions.diagnosis import diagnose_session
 from anser_ros.sessions.nominal_board import NominalBoard
@@ -69,9 +69,16 @@ def test_what_is_right_passes_unchanged(moving, tool):
     same, left_out = checked(moving, tool)
     assert same is tool and left_out == '' and moving.lost == ''
     flux = np.where(np.arange(8) == 1, 0.0, tool.flux)
-    flux[5] = np.nan
-    words = f'all fluxes of coil1 are zero; fluxes of {tool.body} are not finite in 1 of'
+    flux[5], flux[:, 2] = np.nan, np.nan
+    words = (
+        f'coil1 gives nothing but noise: is it dead?; no reading of {tool.sensors.name[2]}; '
+        f'fluxes of {tool.body} are missing or not finite in 1 of {len(flux)} frames'
+    )
     assert words in checked(moving, replace(tool, flux=flux))[1]
+    with pytest.raises(ModelFileError, match=r'no field of coil1, .* dead in the calibration'):
+        known = load_model(MODEL)
+        moments = np.where(np.arange(8) == 1, 0.0, known.moments)
+        diagnose_session(moving, replace(known, moments=moments))
 
 
 @pytest.mark.parametrize('unit', LENGTH_UNITS)
@@ -120,10 +127,17 @@ def test_what_cannot_be_decided_is_not_said(moving, tool):
     assert checked(moving, replace(tool, flux=flip * tool.flux))[1] == ''
 
 
+def test_fluxes_that_are_all_reversed_are_said_to_be(moving, tool):
+    _, words = checked(moving, replace(tool, flux=-tool.flux))
+    assert words.startswith(f'all fluxes of {tool.body} are the reverse of what the drawn board')
+
+
 @pytest.mark.parametrize('unit', FLUX_UNITS)
 def test_fluxes_in_another_unit(moving, tool, unit):
     larger = replace(tool, flux=FLUX_UNITS[unit] * tool.flux)
     says(moving, larger, f'{unit}?', 'drawn board')
+    _, words = checked(moving, replace(tool, flux=tool.flux / FLUX_UNITS[unit]))
+    assert 'times what the drawn board makes at its poses: another unit than T?' in words
     blind = replace(larger, track=None, has_pose=np.zeros_like(tool.has_pose))
     says(moving, replace(tool, flux=0.0 * tool.flux), 'all fluxes of all tools are zero')
     if unit == 'millitesla':  # without poses, so much could still be near a coil
@@ -180,6 +194,9 @@ def test_a_diagnosis_of_one_pose_ends_at_once(moving, tool):
     for use in (diagnose_session, track_session):
         with pytest.raises(PlausibilityError, match=r'times what the model makes .* millitesla'):
             use(large, load_model(MODEL))
+    small = replace(moving, tools=(replace(tool, flux=1e-3 * tool.flux),))
+    with pytest.raises(PlausibilityError, match=r'0.001 times what the model makes'):
+        track_session(small, load_model(MODEL))
 
 
 def test_commands_say_it_in_one_line(tmp_path, capsys):

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from anser_ros.arrays import Array, numbers_of
 from anser_ros.errors import ParameterError, SetupError
+from anser_ros.field.model import plain
 from anser_ros.stamps import NANO
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.recorded import optical_topic, unit_quaternions
@@ -45,7 +46,12 @@ def load_setup(source: SetupSource) -> Setup:
     if isinstance(source, Setup):
         return source
     if isinstance(source, Mapping):
-        return parse_setup(yaml.safe_dump(dict(source), sort_keys=False))
+        try:
+            return parse_setup(yaml.safe_dump(plain(dict(source)), sort_keys=False))
+        except yaml.representer.RepresenterError as error:
+            raise SetupError(
+                f'a setup holds text, numbers, lists and mappings: {error}'
+            ) from error
     if isinstance(source, str) and ('\n' in source or not source.endswith(('.yaml', '.yml'))):
         return parse_setup(source)
     return parse_setup(read_text(path_of(source, 'a setup document'), SetupError))

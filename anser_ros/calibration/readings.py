@@ -227,11 +227,8 @@ def check_measurements(
     many = all(len(m.sensors) >= MANY_SENSORS for m in measurements)
     fewest = FEWEST_FRAMES_OF_MANY if many and field_alone else FEWEST_SCAN_FRAMES
     if frames < fewest:
-        silent = np.all([~np.isfinite(m.flux).any(axis=(0, 1)) for m in measurements], axis=0)
-        dead = ', '.join(map(str, np.flatnonzero(silent).tolist()))
-        hint = f': no reading is of emitter {dead}, counted from 0. Is it dead?' if dead else ''
-        if many and frames >= FEWEST_FRAMES_OF_MANY:
-            hint = '; --estimate none fits the field alone to so few poses of so many sensors'
+        hint = '; --estimate none fits the field alone to so few poses of so many sensors'
+        hint = hint if many and frames >= FEWEST_FRAMES_OF_MANY else ''
         raise FitError(
             f'a calibration needs at least {fewest} frames with poses and valid fluxes, '
             f'got {frames}{hint}'

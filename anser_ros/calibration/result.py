@@ -339,18 +339,15 @@ class Calibration:
 
 def with_provenance(calibration: Calibration, names: Sequence[str]) -> Calibration:
     """Return a calibration whose model says for its file how it was made, of named sessions."""
-    held_out, fit = calibration.held_out, calibration.fit
+    held_out, figures = calibration.held_out, to_document(calibration)
     provenance = {
         'method': 'calibration',
         'sessions': list(dict.fromkeys(names)),
         'n_measurements': calibration.n_measurements,
-        'layout': calibration.layout.describe(),
-        'damping': calibration.damping,
-        'rank': fit.rank,
-        'condition': fit.condition,
-        'noise_t': fit.noise_t,
-        'heldout_flux_rmse_t': rms(held_out.error),
-        'heldout_marginal_rmse_t': float(np.sqrt(np.mean(as_real(held_out.left_over) ** 2))),
+        **{key: figures['choice'][key] for key in ('layout', 'damping', 'rank', 'condition')},
+        'noise_t': calibration.fit.noise_t,
+        'heldout_flux_rmse_t': figures['heldout_flux_rmse_t'],
+        'heldout_marginal_rmse_t': figures['marginal']['heldout_component_rmse_t'],
         'heldout_chi_square': held_out.chi_square,
         'flux_error_t': calibration.model.flux_error_t,
         'nominal_flux_rmse_t': calibration.nominal_rmse_t,
@@ -369,7 +366,7 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
     Errors are root mean squares of the complex residual's magnitude at the measured poses; the
     normalised ones are divided by the range of the measured in-phase fluxes (article, equation 8).
     """
-    held_out, scan = calibration.held_out, calibration.scan
+    held_out, scan, fit = calibration.held_out, calibration.scan, calibration.fit
     inside, span = calibration.residuals, calibration.residuals.span_t
     each = zip(calibration.model.emitters, inside.each_t, held_out.error.T, strict=True)
     nominal = calibration.nominal_rmse_t
@@ -383,40 +380,25 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
         'heldout_n_rmse_percent': 100.0 * rms(held_out.error) / span,
         'heldout_n_mae_percent': 100.0 * float(np.abs(held_out.error).mean()) / span,
         'emitters': [
-            {
-                'name': name,
-                'flux_rmse_t': float(fitted),
-                'heldout_flux_rmse_t': rms(outside),
-                **own,
-            }
-            for (name, fitted, outside), own in zip(each, drawn, strict=True)
+            {'name': name, 'flux_rmse_t': float(inner), 'heldout_flux_rmse_t': rms(outer), **own}
+            for (name, inner, outer), own in zip(each, drawn, strict=True)
         ],
         'marginal': {
-            'noise_t': held_out.noise_t,
-            'flux_noise_t': held_out.flux_noise_t,
+            **{key: getattr(held_out, key) for key in ('noise_t', 'flux_noise_t', 'flux_error_t')},
             'heldout_component_rmse_t': float(np.sqrt(np.mean(as_real(held_out.left_over) ** 2))),
             'heldout_chi_square': held_out.chi_square,
-            'flux_error_t': held_out.flux_error_t,
-            'fit_noise_t': calibration.fit.noise_t,
-            'outlier_fraction': _outlier_fraction(calibration.fit.weights),
+            'fit_noise_t': fit.noise_t,
+            'outlier_fraction': _outlier_fraction(fit.weights),
         },
         **_by_pose(held_out),
         'choice': {
             'layout': calibration.layout.describe(),
             'damping': calibration.damping,
-            'rank': calibration.fit.rank,
-            'condition': calibration.fit.condition,
-            'freedom': calibration.fit.freedom,
-            'alternations': calibration.fit.alternations,
+            **{key: getattr(fit, key) for key in ('rank', 'condition', 'freedom', 'alternations')},
             'curve': [
-                {
-                    'layout': c.layout.describe(),
-                    'n_dipoles': len(c.dipoles),
-                    'damping': damping,
-                    'heldout_t': score,
-                }
-                for c in calibration.candidates
-                for damping, score in c.curve
+                {'layout': c.layout.describe(), 'n_dipoles': len(c.dipoles),
+                 'damping': damping, 'heldout_t': score}
+                for c in calibration.candidates for damping, score in c.curve
             ],
         },
         'nominal_flux_rmse_t': nominal,
@@ -429,7 +411,7 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
         'shift_sigma_m': calibration.model.shift_sigma_m,
         'contradictions': list(calibration.contradictions),
         'optical_noise': None if scan.sensor_fit is None else _optical(scan.sensor_fit.optical),
-    }
+    }  # fmt: skip
 
 
 def _by_pose(held_out: HeldOut) -> dict[str, Any]:
@@ -447,15 +429,9 @@ def _effect(record: EffectRecord) -> dict[str, Any]:
 
 
 def _optical(noise: OpticalNoise) -> dict[str, Any]:
+    sizes = {key: getattr(noise, key) for key in ('position_m', 'rotation_rad')}
     relative = noise.relative_uncertainty
-    return {
-        'position_m': noise.position_m,
-        'rotation_rad': noise.rotation_rad,
-        'uncertainty': {
-            'position_m': relative * noise.position_m,
-            'rotation_rad': relative * noise.rotation_rad,
-        },
-    }
+    return {**sizes, 'uncertainty': {key: relative * size for key, size in sizes.items()}}
 
 
 def _outlier_fraction(weights: Sequence[Array]) -> float:

@@ -79,7 +79,11 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     check_same_board(sessions)
     output.check_file(args.out)
     output.make_folder(args.report)
-    calibration = calibrate_sessions(sessions, options, tell)
+    lost = output.loss_notes(*sessions)
+    try:
+        calibration = calibrate_sessions(sessions, options, tell)
+    except FitError as error:
+        raise FitError('; '.join((str(error), *lost))) from error
     document = to_document(calibration)
     if args.report is not None:
         figures = {
@@ -96,7 +100,7 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     save_model(args.out, calibration.model)
     return output.Result(
         document,
-        (*output.loss_notes(*sessions), *document['unobservable'], *document['contradictions']),
+        (*lost, *document['unobservable'], *document['contradictions']),
         (_table(calibration, document), *_populations(calibration)),
         tuple(filter(None, (args.out, args.report))),
     )
@@ -109,6 +113,7 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
         *([('damping', f'{calibration.damping:g}')] if calibration.damping else []),
         ('residual, T rms', f'{document["flux_rmse_t"]:.4g}'),
         ('held out, T rms', f'{document["heldout_flux_rmse_t"]:.4g}'),
+        ('range of the readings, T', f'{calibration.residuals.span_t:.3g}'),
         ('held out, % of the range', f'{document["heldout_n_rmse_percent"]:.4f}'),
         ("the field model's own error, T", f'{calibration.held_out.flux_error_t:.3g}'),
         ('noise, T a component', f'{calibration.fit.noise_t:.3g}'),

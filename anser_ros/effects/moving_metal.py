@@ -343,25 +343,19 @@ class MovingMetal(Effect[MovingTerm]):
         return EffectRecord(
             self.name,
             {
-                'start_m': at[0].tolist(),
-                'end_m': at[1].tolist(),
-                't_start_s': start,
-                't_end_s': end,
+                'start_m': at[0].tolist(), 'end_m': at[1].tolist(),
+                't_start_s': start, 't_end_s': end,
                 'path': {'time_s': times.tolist(), 'position_m': term.centres(times).tolist()},
-                'polarizability': pairs_of(total),
-                'knots_s': list(term.path.knots),
-                'course': term.course.tolist(),
+                'polarizability': pairs_of(total), 'couplings_m3': pairs_of(couplings),
+                'knots_s': list(term.path.knots), 'course': term.course.tolist(),
                 'body': term.kind,
-                'couplings_m3': pairs_of(couplings),
             },
             {
-                'start_m': spread[0].tolist(),
-                'end_m': spread[1].tolist(),
-                't_start_s': times_sigma[0],
-                't_end_s': times_sigma[1],
+                'start_m': spread[0].tolist(), 'end_m': spread[1].tolist(),
+                't_start_s': times_sigma[0], 't_end_s': times_sigma[1],
                 'path': np.hypot(_place_sigma(term, covariance, times), vague).tolist(),
             },
-        )
+        )  # fmt: skip
 
     def term(self, record: EffectRecord) -> MovingTerm:
         """Make the term from path and couplings; every coupling is a mode of its own."""

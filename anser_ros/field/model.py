@@ -256,6 +256,8 @@ class OpenArm:
 
 
 SCHEMA = 'anser_model/1'
+ERRORS = ('flux_error_t', 'shift_sigma_m', 'noise_t', 'error_share')
+"""What a model states of its own errors, by the names of its fields, which files use too."""
 SESSION = 'session'
 """Parameter of an effect that holds in one of several sessions alone: its name."""
 
@@ -425,27 +427,19 @@ def to_document(model: FieldModel) -> dict[str, Any]:
         'fingerprint': model.fingerprint,
         **({} if model.made_for is None else {'made_for': plain(asdict(model.made_for))}),
         'frame_id': 'fg',
-        'units': {
-            'position': 'm',
-            'direction': '1',
-            'moment': 'A m^2',
-            'frequency': 'Hz',
-            'flux': 'T',
-        },
+        'units': {'position': 'm', 'direction': '1', 'moment': 'A m^2', 'frequency': 'Hz',
+                  'flux': 'T'},
         'emitters': [
             {'name': name, 'frequency_hz': frequency}
             for name, frequency in zip(model.emitters, model.frequencies_hz, strict=True)
         ],
         'provenance': dict(model.provenance),
-        'flux_error_t': model.flux_error_t,
-        'shift_sigma_m': model.shift_sigma_m,
-        'noise_t': model.noise_t,
-        'error_share': model.error_share,
+        **{name: getattr(model, name) for name in ERRORS},
         'effects': [plain(asdict(effect)) for effect in model.effects],
         'columns': ['x', 'y', 'z', 'ux', 'uy', 'uz']
         + [f'm{k}_{part}' for k in range(len(model.emitters)) for part in ('re', 'im')],
         'dipoles': table.tolist(),
-    }
+    }  # fmt: skip
     if model.open_arms:
         document['open_arms'] = plain({body: asdict(a) for body, a in model.open_arms.items()})
     if model.references is not None:
@@ -503,9 +497,7 @@ def from_document(document: Any) -> FieldModel:
     try:
         names = tuple(str(item['name']) for item in emitters)
         frequencies = tuple(float(item['frequency_hz']) for item in emitters)
-        flux_error = float(document.get('flux_error_t', 0.0))
-        shift_sigma = float(document.get('shift_sigma_m', 0.0))
-        noise, share = (float(document.get(key, 0.0)) for key in ('noise_t', 'error_share'))
+        errors = {name: float(document.get(name, 0.0)) for name in ERRORS}
         arms = {
             str(body): OpenArm(
                 float(arm['sigma_m']),
@@ -542,11 +534,8 @@ def from_document(document: Any) -> FieldModel:
         moments=as_complex(table[:, 6:]),
         emitters=names,
         frequencies_hz=frequencies,
-        flux_error_t=flux_error,
-        shift_sigma_m=shift_sigma,
+        **errors,
         open_arms=arms,
-        noise_t=noise,
-        error_share=share,
         modes=modes,
         effects=tuple(_effect(item) for item in effects),
         provenance=provenance,

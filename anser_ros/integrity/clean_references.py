@@ -151,8 +151,9 @@ def check_steady(flux: ComplexArray) -> float | None:
     whole = good.sum(axis=0) > len(flux) // 2
     flux = np.where(good[..., None], flux, np.nan)[:, whole]
     # The variance of a second difference of complex noise is 12 times that of a component.
-    scatter = np.nanmean(np.abs(np.diff(flux, 2, axis=0)) ** 2, axis=2)
-    noise = float(np.sqrt(np.nanmedian(scatter) / 12.0)) if flux.size else 0.0
+    scatter = np.mean(np.abs(np.diff(flux, 2, axis=0)) ** 2, axis=2)
+    scatter = scatter[np.isfinite(scatter)]  # three whole frames in a row
+    noise = float(np.sqrt(np.median(scatter) / 12.0)) if scatter.size else 0.0
     means = [mean_reading(part) for part in np.array_split(flux, PARTS)]
     sigma = np.sqrt(2.0 * PARTS / len(flux)) * noise
     for before, now in itertools.combinations(means, 2):

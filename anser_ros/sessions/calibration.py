@@ -38,6 +38,7 @@ from anser_ros.field.nominal import nominal_model
 from anser_ros.sessions.baseline import readings_of
 from anser_ros.sessions.drawn_calibration import fit_to_drawing, is_for_drawing
 from anser_ros.sessions.nominal_board import NominalBoard, board_of
+from anser_ros.sessions.plausibility import silent
 from anser_ros.sessions.session import Session, shifted
 from anser_ros.sessions.starting_model import made_for
 from anser_ros.settings import Accuracy
@@ -414,6 +415,10 @@ def calibrate_sessions(
     """
     sessions = [part for session in sessions for part in session.mountings()]
     setup = sessions[0].setup
+    for session in sessions:
+        if dead := ', '.join(silent(session.setup, session.tools)):
+            words = 'mend it, or leave it out of the setup'
+            raise FitError(f'{session.path}: {dead} gives nothing but noise: is it dead? {words}')
     surveyed_m = setup.stated.get('tool_coil_position_m', options.surveyed_m)
     options = replace(options, accuracy=setup.accuracy, surveyed_m=surveyed_m)
     chosen = next(engine for engine in all_engines() if engine.accepts(sessions, options))

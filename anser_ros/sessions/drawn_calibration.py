@@ -377,10 +377,8 @@ def _calibration(
         nominal_rmse_t=residuals(stated, nominal).rmse_t if all(typed) and nominal else None,
         undetermined=(frame, *_gaps(stated)), contradictions=_doubts(fit, generator),
         emitters=emitter_rows(fit, generator), more={
-            'frame': {
-                'shift_sigma_m': fit.frame_sigma[:3].tolist(),
-                'turn_sigma_rad': fit.frame_sigma[3:].tolist(),
-            },
+            'frame': {'shift_sigma_m': fit.frame_sigma[:3].tolist(),
+                      'turn_sigma_rad': fit.frame_sigma[3:].tolist()},
             'plate': {
                 'shift_m': fit.plate[:3].tolist(), 'turn_rad': fit.plate[3:6].tolist(),
                 'scale': float(1.0 + fit.plate[6]),

@@ -7,7 +7,7 @@ on evidence only, and names it; what the data cannot decide passes.
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -57,7 +57,12 @@ POOR, GOOD = 0.6, 0.8
 """Shares of readings that fit: below the first the poses are in doubt, above the second another
 reading is right. Half a turn about an axis leaves a third of a triaxial coil's readings right."""
 TOO_LARGE = 100.0
-"""Factor over the nominal board's fluxes from which a unit is in doubt; gains stay far below."""
+"""Factor over the nominal board's fluxes, or below them, from which a unit is in doubt; gains stay
+far inside."""
+SILENT, WEAK = 2.0, 0.01
+"""Root mean square of an emitter's fluxes, over the stated noise of a component (noise alone has
+1.4) and over the strongest emitter's, below both of which it is dead: readings in another unit are
+below the first alone, a small coil far away below the second."""
 
 
 @dataclass(frozen=True)
@@ -127,22 +132,24 @@ ALSO = {
 """What makes the same of typed places that are symmetric, all of one orientation, if reversed."""
 
 
-def check_conventions(path: str, setup: Setup, nominal: NominalBoard, tool: Measurements) -> None:
-    """Check units and order of a tool's poses, and the unit of its fluxes, against each other.
+def check_conventions(
+    path: str, setup: Setup, nominal: NominalBoard, tool: Measurements
+) -> list[str]:
+    """Check units and order of a tool's poses, and unit and sign of its fluxes, by the drawing.
 
-    Raises `PlausibilityError` when the poses contradict the fluxes as they stand and fit them when
-    read in another way, or the fluxes are larger than the board can make by the factor of a unit.
+    Returns words on what the fluxes alone cannot be wrong by: all small, or all reversed. Raises
+    `PlausibilityError` when the poses contradict the fluxes as they stand and fit them when read
+    in another way, or the fluxes are larger than the board can make by the factor of a unit.
     """
     field = nominal.field
     if field is None:
-        return
+        return []
     rows, columns = _chosen(tool)
     fit = partial(_fit, field, tool, rows, columns)
     share, gain = fit(AS_WRITTEN) if len(rows) >= FEWEST_READINGS else (np.nan, np.nan)
     if share > GOOD:
         size = np.linalg.norm(tool.flux[rows, columns], axis=1)
-        _check_flux(path, tool, size, size / gain, 'the drawn board makes at its poses')
-        return
+        return _check_flux(path, tool, size, size / gain, 'the drawn board makes at its poses')
     for reading in OTHER_READINGS if share < POOR else ():
         better, _ = fit(reading)
         if better > GOOD:
@@ -156,6 +163,12 @@ def check_conventions(path: str, setup: Setup, nominal: NominalBoard, tool: Meas
                 f'{reading.words}{also if is_typed else ""}'
             )
     _check_size(path, setup, field, tool)
+    if share < POOR and fit(AS_WRITTEN, sign=-1.0)[0] > GOOD:
+        return [
+            f'all fluxes of {tool.body} are the reverse of what the drawn board makes at its '
+            'poses: are all axes stated reversed, or the currents?'
+        ]
+    return []
 
 
 def _chosen(tool: Measurements) -> tuple[Integers, Integers]:
@@ -171,10 +184,11 @@ def _chosen(tool: Measurements) -> tuple[Integers, Integers]:
 
 
 def _fit(
-    drawn: FieldFunction, tool: Measurements, rows: Integers, columns: Integers, reading: Reading
-) -> tuple[float, float]:
+    drawn: FieldFunction, tool: Measurements, rows: Integers, columns: Integers,
+    reading: Reading, sign: float = 1.0,
+) -> tuple[float, float]:  # fmt: skip
     """Share of readings (P,) that fit when poses are read so, and the fluxes' common factor."""
-    flux = tool.flux[rows, columns]
+    flux = sign * tool.flux[rows, columns]
     frames, where = np.unique(rows, return_inverse=True)
     placed = reading.placed(tool.position[frames], tool.rotation[frames])
     centres, axes = tool.sensors.placed(*placed)
@@ -190,18 +204,21 @@ def _fit(
 
 def _check_flux(
     path: str, tool: Measurements, size: Array, expected: Array | float, what: str
-) -> None:
-    """Raise where fluxes are larger than what is expected by the factor of a unit."""
-    if (gain := float(np.median(size / np.maximum(expected, 1e-300)))) > TOO_LARGE:
-        unit = unit_words(gain, FLUX_UNITS) or 'another unit than T'
-        raise PlausibilityError(
-            f'{path}: fluxes of {tool.body} are {np.median(size):.3g} T, {gain:.2g} times what '
-            f'{what}: {unit}?'
-        )
+) -> list[str]:
+    """Words where fluxes are smaller than what is expected by the factor of a unit; raise where
+    they are larger.
+    """
+    gain = float(np.median(size / np.maximum(expected, 1e-300)))
+    unit = unit_words(gain, FLUX_UNITS) or 'another unit than T'
+    words = f'fluxes of {tool.body} are {np.median(size):.3g} T, {gain:.2g} times what {what}'
+    if gain > TOO_LARGE:
+        raise PlausibilityError(f'{path}: {words}: {unit}?')
+    return [f'{words}: {unit}?'] if gain < 1.0 / TOO_LARGE else []
 
 
 def check_unit(path: str, model: FieldModel, tool: Measurements, noise_t: float) -> None:
-    """Raise `PlausibilityError` where a tool reads many times what a model has at its poses.
+    """Raise `PlausibilityError` where a tool reads many times what a model has at its poses, or
+    hardly anything of it.
 
     Poses where it has no more than the noise, T, are far away, and tell nothing of a unit.
     """
@@ -210,7 +227,9 @@ def check_unit(path: str, model: FieldModel, tool: Measurements, noise_t: float)
     size, expected = (np.linalg.norm(f, axis=1) for f in (tool.flux[rows, columns], made))
     near = expected > noise_t
     if np.count_nonzero(near) >= FEWEST_READINGS:
-        _check_flux(path, tool, size[near], expected[near], 'the model makes at its poses')
+        what = 'the model makes at its poses'
+        for words in _check_flux(path, tool, size[near], expected[near], what):
+            raise PlausibilityError(f'{path}: {words}')
 
 
 def _check_size(path: str, setup: Setup, drawn: FieldFunction, tool: Measurements) -> None:
@@ -251,20 +270,15 @@ def plausible_tools(
     `PlausibilityError` with the evidence, in one line.
     """
     nominal, kept, words = NominalBoard.of(setup), [], []
-    driven = [np.nan_to_num(tool.flux).any(axis=(0, 1)) for tool in tools]
-    silent = np.flatnonzero(~np.any(driven, axis=0)) if tools else ()
-    if len(silent) == len(setup.emitter_names):
+    if tools and not any(np.nan_to_num(tool.flux).any() for tool in tools):
         raise PlausibilityError(f'{path}: all fluxes of all tools are zero: an empty band?')
-    words += [f'all fluxes of {setup.emitter_names[k]} are zero' for k in silent]
+    words += [f'{name} gives nothing but noise: is it dead?' for name in silent(setup, tools)]
     for tool in tools:
-        words += _check_refused(path, tool, refused)
-        bad = ~np.isfinite(tool.flux).all(axis=2) & (tool.flags == 0)
-        if count := int(bad.any(axis=1).sum()):
-            words.append(f'fluxes of {tool.body} are not finite in {count} of {len(bad)} frames')
+        words += [*_check_refused(path, tool, refused), *_missing(tool)]
         _check_clocks(path, tool)
         thawed, remarks = _thawed(path, tool)
         words += remarks
-        check_conventions(path, setup, nominal, thawed)
+        words += check_conventions(path, setup, nominal, thawed)
         check_distance(path, setup, thawed)
         if times := ', '.join(f'{time:.4g}' for time in times_of_mounting(thawed)):
             words.append(
@@ -272,6 +286,29 @@ def plausible_tools(
             )
         kept.append(thawed)
     return tuple(kept), '; '.join(words)
+
+
+def silent(setup: Setup, tools: Sequence[Measurements]) -> list[str]:
+    """Return the names of emitters of which some tools read no more than noise; of all, none."""
+    power = np.array([np.nansum(np.abs(t.flux) ** 2, axis=(0, 1)) for t in tools]).sum(axis=0)
+    count = np.array([np.isfinite(t.flux).sum(axis=(0, 1)) for t in tools]).sum(axis=0)
+    size = np.sqrt(power / np.maximum(count, 1)) if tools else np.zeros(0)
+    least = min(SILENT * setup.accuracy.flux_noise_t, WEAK * size.max(initial=0.0))
+    return [setup.emitter_names[k] for k in np.flatnonzero(size < least)]
+
+
+def _missing(tool: Measurements) -> list[str]:
+    """Words for sensors without any reading, and for frames that lack those of others."""
+    read = np.isfinite(tool.flux)
+    dead = ~np.nan_to_num(tool.flux).any(axis=(0, 2))
+    rest = read[:, ~dead][:, :, read.any(axis=(0, 1))]
+    lacking = int((~rest.all(axis=(1, 2))).sum())
+    names = ', '.join(name for name, gone in zip(tool.sensors.name, dead, strict=True) if gone)
+    words = [f'no reading of {names}'] if names else []
+    if lacking:
+        count = f'{lacking} of {len(read)} frames'
+        words.append(f'fluxes of {tool.body} are missing or not finite in {count}, left out')
+    return words
 
 
 def check_points(tracked: Array, true: Array) -> None:

@@ -13,6 +13,7 @@ from anser_ros.field.model import FieldModel, from_document, to_document
 from anser_ros.field.nominal import nominal_model
 from anser_ros.fingerprint import Identity
 from anser_ros.sessions.nominal_board import board_of
+from anser_ros.sessions.plausibility import silent
 from anser_ros.sessions.session import Session
 from anser_ros.wire.setup import Setup
 from anser_ros.wire.text_files import NOMINAL, read_document, write_document
@@ -176,15 +177,26 @@ def _bodies_of(model: FieldModel, setup: Setup) -> set[str]:
 
 
 def check_fits(model: FieldModel, session: Session) -> None:
-    """Raise `ModelFileError` when a model is not of a session's emitters; see `check_made_for`."""
+    """Raise `ModelFileError` when a model is not of a session's emitters, or lacks one of them.
+
+    See `check_made_for`.
+    """
     ours, theirs = model.frequencies_hz, session.setup.frequencies_hz
     if len(ours) == len(theirs) and not np.allclose(ours, theirs, rtol=1e-3):
         raise ModelFileError(
             f'the model drives at {list(ours)} Hz; the session {session.path} at {list(theirs)} Hz'
         )
     check_emitters(session.setup, model, f'the session {session.path}')
+    size, dead = np.abs(model.moments).max(axis=0), silent(session.setup, session.tools)
+    for name in np.array(model.emitters)[size < NO_FIELD * size.max()].tolist():
+        if session.tools and name not in dead:
+            words = 'was it dead in the calibration?'
+            raise ModelFileError(f'the model has no field of {name}, {session.path} has: {words}')
 
 
+NO_FIELD = 1e-3
+"""Largest moment of an emitter, over that of all, below which a model was made while it was dead:
+coils of a board are alike, and noise over a scan makes a ten thousandth."""
 FOUND_ON = 'session_start_ns'
 """Key in a drift's evidence: the first stamp, ns, of the session on which it took its course."""
 

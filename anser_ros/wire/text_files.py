@@ -106,14 +106,17 @@ def _check(text: str) -> None:
             raise yaml.YAMLError(f'more than {MOST_NODES} values, aliases written out')
 
 
-def read_document(path: str | os.PathLike[str]) -> Any:
-    """Parse a model file; raises `ModelFileError` when it can't be read or is no YAML."""
+def read_document(path: str | os.PathLike[str], schema: str = '') -> Any:
+    """Parse a model file; raises `ModelFileError` when it is no YAML of the schema, if any."""
     text = read_text(path, ModelFileError)
     try:
-        return read_yaml(text)
+        found = read_yaml(text)
     except (yaml.YAMLError, ValueError) as error:
         words = ' '.join(str(error).split())
         raise ModelFileError(f'{os.fspath(path)}: not YAML: {words}') from error
+    if schema and (not isinstance(found, dict) or found.get('schema') != schema):
+        raise ModelFileError(f'{os.fspath(path)}: its schema must be {schema}')
+    return found
 
 
 def write_document(path: str | os.PathLike[str], document: Any) -> None:

@@ -242,19 +242,14 @@ def _bends(fit: StillFit) -> tuple[EffectRecord, ...]:
     return (
         EffectRecord(
             BEND,
-            {
-                'body': fit.model.measured.body,
-                'rms_m': np.sqrt(np.mean(lift**2, axis=1)).tolist(),
-                'largest_m': float(np.abs(lift).max()),
-            },
+            {'body': fit.model.measured.body, 'largest_m': float(np.abs(lift).max()),
+             'rms_m': np.sqrt(np.mean(lift**2, axis=1)).tolist()},
             {},
-            {
-                'log_probability': fit.evidence['bend'],
-                'summary': 'the body is not flat, and bent otherwise at each pose',
-                'remedy': 'none: at another pose the bend is another',
-            },
+            {'log_probability': fit.evidence['bend'],
+             'summary': 'the body is not flat, and bent otherwise at each pose',
+             'remedy': 'none: at another pose the bend is another'},
         ),
-    )
+    )  # fmt: skip
 
 
 def _misplaced(

@@ -81,17 +81,13 @@ def to_model(found: PoseDiagnosis, before: Mapping[str, Any] | None = None) -> d
         'provenance': {'session': found.session.path},
         'held_out_position_rmse_m': document['held_out']['position_rmse_after_m'],
         'held_out_orientation_rmse_rad': document['held_out']['orientation_rmse_after_rad'],
-        'support': {
-            'low_m': low.tolist(),
-            'high_m': high.tolist(),
-            'first_ns': first,
-            'last_ns': last,
-        },
+        'support': {'low_m': low.tolist(), 'high_m': high.tolist(),
+                    'first_ns': first, 'last_ns': last},
         'effects': [
             {key: effect[key] for key in ('name', 'parameters', 'uncertainty')}
             for effect in [*document['effects'], *known]
         ],
-    }
+    }  # fmt: skip
 
 
 def as_document(values: Mapping[str, Any]) -> dict[str, Any]:

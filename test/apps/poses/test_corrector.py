@@ -228,6 +228,9 @@ def test_a_model_corrects_and_judges_another_session(bent, tmp_path, capsys):
     path.write_text(yaml.safe_dump(other_sensor), encoding='utf-8')
     assert main(['evaluate', *plain, '--model', str(path)]) != 0
     assert 'the model knows tip, the session sensor_0' in capsys.readouterr().err
+    path.write_text('schema: anser_model/1', encoding='utf-8')
+    assert main(['evaluate', *plain, '--model', str(path)]) == 2
+    assert f'{path}: its schema must be anser_pose_model/1' in capsys.readouterr().err
 
 
 def test_a_map_of_points_is_applied_where_it_is_confirmed(tmp_path, capsys):

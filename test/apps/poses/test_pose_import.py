@@ -122,6 +122,12 @@ def test_tum_csv_and_static_files_one_after_the_other(tmp_path):
     tum = write(tmp_path / 'a.tum', '# t x y z', f'1.5 0.1 0.2 0.3 {q}', f'1.6 0.1 0.2 0.4 {q}')
     poses = one_of(import_poses([tum]))
     np.testing.assert_allclose(poses.position[:, 2], [0.3, 0.4])
+    thousand = write(tmp_path / 'mm.tum', f'1.5 100 200 300 {q}', f'1.6 100 200 400 {q}')
+    with pytest.raises(ParameterError, match=r'positions of 4\d\d.* m: --unit mm\?'):
+        import_poses([thousand])
+    np.testing.assert_allclose(
+        one_of(import_poses([thousand], unit='mm')).position, poses.position
+    )
     table = write(tmp_path / 'a.csv', 'stamp_ns,sensor,x_mm,y_mm,z_mm,qx,qy,qz,qw',
                   '1000000000,tip,1,2,3,0,0,0,1', '1100000000,tip,,,,,,,')  # fmt: skip
     poses = import_poses([table]).sensors['tip']

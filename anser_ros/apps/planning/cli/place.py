@@ -229,32 +229,28 @@ def to_document(proposal: Proposal, origin: str) -> dict[str, Any]:
         'uncorrected_error_m': proposal.metals[0].error_m,
         'places': [
             {
-                'name': table.name[i],
-                'channel': int(table.channel[i]),
-                'position_m': table.position[i].tolist(),
-                'axis': table.axis[i].tolist(),
+                'name': table.name[i], 'channel': int(table.channel[i]),
+                'position_m': table.position[i].tolist(), 'axis': table.axis[i].tolist(),
                 'length_m': float(table.length[i]),
             }
             for i in best.coils
         ],
         'expected': [
             {
-                'references': len(design.coils),
-                'error_m': design.error_m,
+                'references': len(design.coils), 'error_m': design.error_m,
                 'by_metal_m': dict(zip(names, design.errors_m.tolist(), strict=True)),
             }
             for design in proposal.designs
         ],
         'random': [
             {
-                'references': count,
-                'mean_error_m': float(np.mean([d.error_m for d in drawn])),
+                'references': count, 'mean_error_m': float(np.mean([d.error_m for d in drawn])),
                 'best_error_m': float(min(d.error_m for d in drawn)),
                 'worst_error_m': float(max(d.error_m for d in drawn)),
             }
             for count, drawn in proposal.random.items()
         ],
-    }
+    }  # fmt: skip
 
 
 def _rows(document: dict[str, Any]) -> list[list[str]]:

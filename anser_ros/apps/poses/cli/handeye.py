@@ -190,6 +190,8 @@ def render(found: HandEye, document: dict[str, Any]) -> str:
     ]  # fmt: skip
     lines = [*clock_words(document), *left_out_words(document)]
     is_open, state = bool(found.undetermined), found.fit.state
+    parts = enumerate(state.parts)
+    each = {part.view.sensor: (replace(state, parts=(part,)), f'C{k}') for k, part in parts}
     return page(
         'Hand-eye',
         top(
@@ -210,12 +212,5 @@ def render(found: HandEye, document: dict[str, Any]) -> str:
         ),
         [heading('Not determined'), listed(found.undetermined)] if is_open else [],
         heading('Residuals over time'),
-        picture(
-            over_time(
-                {
-                    part.view.sensor: (replace(state, parts=(part,)), f'C{k}')
-                    for k, part in enumerate(state.parts)
-                }
-            )
-        ),
+        picture(over_time(each)),
     )

@@ -16,7 +16,7 @@ import yaml
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from anser_ros.apps.poses.corrector import corrected, to_document, to_model
+from anser_ros.apps.poses.corrector import MODEL_SCHEMA, corrected, to_document, to_model
 from anser_ros.apps.poses.diagnosis import PoseDiagnosis, diagnose_poses
 from anser_ros.apps.poses.effect import Role, effect_with
 from anser_ros.apps.poses.importing import read_pose_session
@@ -195,14 +195,8 @@ def render_poses(found: PoseDiagnosis, document: dict[str, Any], session: str) -
             'sensor, after with what was found as well.',
         ),
         table(
-            [
-                'sensor',
-                'registration only, mm',
-                'with lever arm and mount, mm',
-                'with effects, mm',
-                'with mount, deg',
-                'with effects, deg',
-            ],
+            ['sensor', 'registration only, mm', 'with lever arm and mount, mm',
+             'with effects, mm', 'with mount, deg', 'with effects, deg'],
             _by_sensor(document, ['registration_only', *WHEN], WHEN, '.2f'),
         ),
         _by_distance(before, after),
@@ -242,7 +236,7 @@ def render_poses(found: PoseDiagnosis, document: dict[str, Any], session: str) -
                 [[short_label(row['candidate']), row['why']] for row in document['refused']],
             ),
         ),
-    )
+    )  # fmt: skip
 
 
 def short_label(label: str) -> str:
@@ -500,7 +494,7 @@ def _session(
     if idle:
         names = ', '.join('--' + name.replace('stated', 'set').replace('_', '-') for name in idle)
         raise ParameterError(f'without effect on a session of poses, leave out: {names}')
-    model = read_document(args.model) if args.model else None
+    model = read_document(args.model, MODEL_SCHEMA) if args.model else None
     return load_poses(args.session, args), model
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 
-from anser_ros.apps.poses.corrector import OK, OUTSIDE, PoseCorrector
+from anser_ros.apps.poses.corrector import MODEL_SCHEMA, OK, OUTSIDE, PoseCorrector
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
@@ -45,7 +45,7 @@ class Corrector(AnserNode):
         super().__init__(**options)
         if not self.parameters.model:
             raise ParameterError('model must name the model.yaml of `anser diagnose --poses`')
-        self._corrector = PoseCorrector(read_document(self.parameters.model))
+        self._corrector = PoseCorrector(read_document(self.parameters.model, MODEL_SCHEMA))
         self._outputs: dict[str, tuple[Any, Any]] = {}
         self._states: dict[str, Counter[str]] = {}
         self._latest: dict[str, tuple[float, str, float]] = {}
