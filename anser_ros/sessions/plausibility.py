@@ -300,7 +300,7 @@ def silent(setup: Setup, tools: Sequence[Measurements]) -> list[str]:
 def _missing(tool: Measurements) -> list[str]:
     """Words for sensors without any reading, and for frames that lack those of others."""
     read = np.isfinite(tool.flux)
-    dead = ~np.nan_to_num(tool.flux).any(axis=(0, 2))
+    dead = np.asarray(~np.nan_to_num(tool.flux).any(axis=(0, 2)))
     rest = read[:, ~dead][:, :, read.any(axis=(0, 1))]
     lacking = int((~rest.all(axis=(1, 2))).sum())
     names = ', '.join(name for name, gone in zip(tool.sensors.name, dead, strict=True) if gone)
