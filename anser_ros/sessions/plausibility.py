@@ -217,8 +217,7 @@ def _check_flux(
 
 
 def check_unit(path: str, model: FieldModel, tool: Measurements, noise_t: float) -> None:
-    """Raise `PlausibilityError` where a tool reads many times what a model has at its poses, or
-    hardly anything of it.
+    """Raise `PlausibilityError` where a tool reads many times what a model has there, or nothing.
 
     Poses where it has no more than the noise, T, are far away, and tell nothing of a unit.
     """

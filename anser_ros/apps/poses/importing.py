@@ -171,11 +171,12 @@ def _named(
         order, sense = ORDERS[quaternion or one.form]
         away = np.linalg.norm(table[:, 2:5], axis=1)
         middle = np.median(away[away < FARTHEST]) if (away < FARTHEST).any() else 0.0
-        scale = LENGTH_M[unit or one.unit or 'm']
-        if scale * middle > FARTHEST_M and not unit:
-            words = f'positions of {middle:.4g} {one.unit or "state no unit"}'
+        if middle > FARTHEST_M and not (unit or one.unit):
+            words = f'positions of {middle:.4g} state no unit'
             raise ParameterError(f'{path}: {label}: {words}: --unit mm?')
-        table[:, 2:5] *= scale
+        if middle > FARTHEST_M and one.unit == 'm' and not unit:
+            lost.append(f'{label}: positions of {middle:.4g} m: --unit mm?')
+        table[:, 2:5] *= LENGTH_M[unit or one.unit or 'm']
         table[:, 5:] = table[:, 5:][:, list(order)] * [sense, sense, sense, 1.0]
         found[label] = table
     return found
