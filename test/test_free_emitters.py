@@ -19,6 +19,7 @@ from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import SESSION, Dipoles, EffectRecord
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.sessions.diagnosis import diagnose_session
 from anser_ros.sessions.prepared import correct, prepare
 from anser_ros.sessions.session import Session
 from anser_ros.settings import Accuracy
@@ -222,9 +223,27 @@ def test_sessions_stand_by_themselves_and_share_field_and_sensors(size):
     )
     setup = Setup('fg', 1.0, Emitter('free', {}, coils), sensors, None, {})
     for part, name in zip(parts, names, strict=True):
-        session = Session(name, setup, 0, (part,), None)
+        session = Session(name, setup, 10**9, (part,), None)
         prepared = prepare(session, model)
         assert not any(SESSION in record.parameters for record in prepared.model.effects)
         (tool,) = correct(prepared).session.tools
         left = residuals([tool], prepared.model)
         assert left.unexplained < 4e-3, name
+        # Reversed or exchanged coils hide neither how it stands nor whose the delays are, and a
+        # lever arm hides no turn.
+        wrong = {
+            '': part,
+            'coil_polarity': replace(part, flux=part.flux * [1, -1, -1]),
+            'swapped_channels': replace(part, flux=part.flux[:, [1, 0, 2]]),
+            'lever_arm': replace(part, position=part.position - part.rotation @ [6e-3, 0.0, 8e-3]),
+        }
+        noise = {
+            'outliers',
+            'excess_noise',
+            'loose_contact',
+        }  # the setup states less than there is
+        for fault, tool in wrong.items() if size and name == names[1] else ():
+            found = diagnose_session(replace(session, tools=(tool,)), model)
+            named = {one.record.name for one in found.diagnosis.findings}
+            assert named - noise == {fault} - {''}, name
+            assert found.after.position_rmse_m < 3e-4

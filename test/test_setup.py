@@ -148,6 +148,8 @@ def test_a_volume_may_reach_around_the_emitters():
         f'{DEMO.read_text()}\nvolume: {{low_m: {[*box[0]]}, high_m: {[*box[1]]}}}\n'
     )
     assert setup.volume == box
+    samples = stated_volume(setup).samples()
+    np.testing.assert_allclose([samples.min(axis=0), samples.max(axis=0)], box)
 
 
 def test_without_a_stated_volume_it_follows_from_the_board():

@@ -128,32 +128,23 @@ def fit_scan(
     # Only the quadrature tells noise from the model's error, and a constant field has none.
     is_told = held_out.flux_noise_t > 2.0 * SMALLEST_NOISE_T
     model = FieldModel(
-        positions=whole.dipoles.positions,
-        directions=whole.dipoles.directions,
-        moments=whole.fit.moments,
-        emitters=generator.emitters,
-        frequencies_hz=generator.frequencies_hz,
-        flux_error_t=flux_error,
+        positions=whole.dipoles.positions, directions=whole.dipoles.directions,
+        moments=whole.fit.moments, emitters=generator.emitters,
+        frequencies_hz=generator.frequencies_hz, flux_error_t=flux_error,
         noise_t=max(held_out.flux_noise_t, float(np.sqrt(missed))) if is_told else 0.0,
         error_share=held_out.error_share if is_told else 0.0,
         shift_sigma_m=0.0 if sensors is None else sensors.shift_sigma_m,
         open_arms={} if sensors is None else _open_arms(posed, sensors),
-        effects=scan.corrections,
-        gaps=gaps_of(whole, damping, posed, held_out.gap_factor),
-    )
+        effects=scan.corrections, gaps=gaps_of(whole, damping, posed, held_out.gap_factor),
+    )  # fmt: skip
     calibration = Calibration(
-        model=model,
-        fit=whole.fit,
-        held_out=held_out,
-        layout=layout,
-        damping=damping,
+        model=model, fit=whole.fit, held_out=held_out, layout=layout, damping=damping,
         n_measurements=sum(int(m.usable.sum()) for m in posed),
-        residuals=residuals(posed, model),
-        scan=scan,
+        residuals=residuals(posed, model), scan=scan,
         nominal_rmse_t=None if nominal is None else residuals(posed, nominal).rmse_t,
         candidates=selection.candidates,
         contradictions=() if sensors is None else contradiction_words(sensors, names),
-    )
+    )  # fmt: skip
     return with_provenance(calibration, names)
 
 

@@ -189,16 +189,10 @@ def learn_error_map(tracked: Array, true: Array, *, registers: bool = False) -> 
     shape = held_out.shapes[held_out.decide(held_out.everything)]
     before, after = (held_out.nested(decided=decided) for decided in (False, True))
     return ErrorMap(
-        PositionMap(points.tracked, errors, shape),
-        rotation,
-        translation,
-        points.tracked,
-        errors,
-        held_out.error_of(before),
-        held_out.error_of(after),
-        held_out.clearness(before, after),
-        held_out.tried(),
-    )
+        PositionMap(points.tracked, errors, shape), rotation, translation, points.tracked,
+        errors, held_out.error_of(before), held_out.error_of(after),
+        held_out.clearness(before, after), held_out.tried(),
+    )  # fmt: skip
 
 
 class _Pairs:

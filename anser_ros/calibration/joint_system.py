@@ -106,13 +106,9 @@ def linearise(part: Measurements, modes: FieldModes, field: Array) -> Linear:
     flux, by_place, by_axis = flux_slopes(part, modes.sites, as_complex(modes.vectors @ field))
     return Linear(
         as_real(part.flux) - as_real(flux),
-        pose_slopes(*part.placed(), part.position, by_place, by_axis),
-        part,
-        modes,
-        flux,
-        by_place,
-        by_axis,
-    )
+        pose_slopes(*part.placed(), part.position, by_place, by_axis), part, modes, flux,
+        by_place, by_axis,
+    )  # fmt: skip
 
 
 def open_directions(

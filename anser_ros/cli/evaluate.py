@@ -293,25 +293,26 @@ def _few_notes(session: Session) -> tuple[str, ...]:
 
 
 def why_withheld(model: FieldModel, evaluation: Evaluation) -> tuple[str, ...]:
-    """State why hardly a coil has a pose, or most misfit a model that knows some of them."""
+    """State why hardly a body, or else a coil, has a pose, or most misfit a known model."""
     parameters = [effect.parameters for effect in model.effects]
     each = (p.get('channels', [p['channel']] if 'channel' in p else ()) for p in parameters)
     known = sorted({channel for channels in each for channel in channels})
-    poses = [pose for coil in evaluation.sensors.values() for pose in coil.estimates]
+    of_bodies = any(2 * body.ok.mean() > 1 for body in evaluation.bodies.values())
+    asked = evaluation.sensors if of_bodies else evaluation.bodies or evaluation.sensors
+    poses = [pose for series in asked.values() for pose in series.estimates]
     found = Counter(pose.state for pose in poses)
     worst, count = max(found.items(), key=lambda one: (one[0] != OK, one[1]), default=(OK, 0))
     is_other = worst == RESIDUAL and known and 2 * count > len(poses)
     if worst == OK or (found[OK] > HARDLY * len(poses) and not is_other):
         return ()
-    of_bodies = any(body.ok.mean() > HARDLY for body in evaluation.bodies.values())
     whose = 'most poses of single coils are' if of_bodies else 'most poses are'
     reasons = [pose.reason for pose in poses if pose.state == worst and pose.reason]
     such = f' ({reasons[len(reasons) // 2]})' if reasons else ''
     listed = f'the coils of its calibration (channels {", ".join(map(str, known))})'
     why = (
         f': the model knows {listed if known else "no coil by itself"}; another one is off in '
-        'gain and axis, by 2 % and 1 deg as wound by hand: calibrate with what is tracked, and '
-        'look for metal'
+        'gain and axis, by 2 % and 1 deg as wound by hand: calibrate with what is tracked; '
+        'anser diagnose names what else differs, as metal does'
     )
     return (
         f'{whose} withheld, state {worst} in {count} of {len(poses)}{such}'

@@ -336,15 +336,11 @@ def _checked(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmati
     if np.isfinite(term.effect.inexact):
         remainder = _stays(fit.state, columns, noise, max(1.0, decisions.MODEL_ERROR * noise))
     return Confirmation(
-        power,
-        _varying(fit.state, columns, noise) / max(power, 1e-300),
-        power / max(left_tools, 1e-300),
-        remainder / max(power, 1e-300),
-        inexact=term.effect.inexact,
-        alike=_crowd(fit, term),
-        plausible=_plausible(fit, term),
+        power, _varying(fit.state, columns, noise) / max(power, 1e-300),
+        power / max(left_tools, 1e-300), remainder / max(power, 1e-300),
+        inexact=term.effect.inexact, alike=_crowd(fit, term), plausible=_plausible(fit, term),
         helps=_helps(without, fit.state, columns),
-    )
+    )  # fmt: skip
 
 
 def _helps(without: State, with_it: State, columns: Sequence[Array | None]) -> bool:

@@ -473,26 +473,17 @@ def build_problem(
     omega = 2 * np.pi * np.asarray(model.frequencies_hz)
     fields = Fields(model.dipoles, illumination, omega)
     apparatus = Apparatus(
-        tools=tuple(tool.sensors for tool in posed),
+        tools=tuple(tool.sensors for tool in posed), emitters=omega.size, omega=omega,
         references=None if references is None else references.readings.sensors,
-        emitters=omega.size,
-        omega=omega,
-        duration=float(end - start),
-        illumination=illumination,
+        duration=float(end - start), illumination=illumination, board=board_box(drawn or model),
         visited_box=np.stack([centres.min(axis=0), centres.max(axis=0)]),
-        board=board_box(drawn or model),
-    )
+    )  # fmt: skip
     return Problem(
-        tools=posed,
-        blocks=tuple(_numbers(tool.time, edges) for tool in posed),
-        references=references,
-        reference_blocks=reference_blocks,
-        fields=fields,
-        apparatus=apparatus,
-        spread=spread,
-        good=tuple(tool.valid.copy() for tool in posed),
+        tools=posed, blocks=tuple(_numbers(tool.time, edges) for tool in posed),
+        references=references, reference_blocks=reference_blocks, fields=fields,
+        apparatus=apparatus, spread=spread, good=tuple(tool.valid.copy() for tool in posed),
         gaps_t=tuple(_gaps_t(tool, model) for tool in posed),
-    )
+    )  # fmt: skip
 
 
 def _gaps_t(tool: Measurements, model: FieldModel) -> Array:

@@ -193,6 +193,18 @@ def _measured(view: View, terms: Sequence[Term]) -> View:
     )
 
 
+def coils_read(plugs: Sequence[Term], channels: Integers) -> Integers:
+    """Return the numbers of the coils that are read on channels (S,), of which some are exchanged.
+
+    What was known of a coil before its plug was found elsewhere, its gain, has gone with it.
+    """
+    for term in plugs:
+        mixing = term.effect.channel_matrix(term, channels) if not term.theta.size else None
+        if mixing is not None:
+            channels = channels[np.abs(mixing).argmax(axis=1)]
+    return channels
+
+
 DECOMPRESSION_STEPS = 12
 """Most steps of the fixed point that undoes a compression. Each leaves of the error about the
 share that the compression takes of a change of the signal."""
@@ -308,9 +320,11 @@ class Correction:
         for term in terms:
             added = term.effect.offset(term, number, self.omega.size)
             values = values if added is None else values - added
-        for term in terms:
-            factor = term.effect.response(term, number, self.omega)
+        coils = number
+        for term in reversed(terms):
+            factor = term.effect.response(term, coils, self.omega)
             values = values if factor is None else values / factor
+            coils = coils_read([term], coils)
         for term in reversed(terms):
             mixing = term.effect.channel_matrix(term, number)
             if mixing is not None:

@@ -529,20 +529,13 @@ def from_document(document: Any) -> FieldModel:
         raise ModelFileError('model: provenance must be a mapping')
     references, gaps = document.get('references'), document.get('gaps')
     model = FieldModel(
-        positions=table[:, :3].copy(),
-        directions=table[:, 3:6].copy(),
-        moments=as_complex(table[:, 6:]),
-        emitters=names,
-        frequencies_hz=frequencies,
-        **errors,
-        open_arms=arms,
-        modes=modes,
-        effects=tuple(_effect(item) for item in effects),
-        provenance=provenance,
-        made_for=_made_for(document.get('made_for')),
+        positions=table[:, :3].copy(), directions=table[:, 3:6].copy(),
+        moments=as_complex(table[:, 6:]), emitters=names, frequencies_hz=frequencies, **errors,
+        open_arms=arms, modes=modes, effects=tuple(_effect(item) for item in effects),
+        provenance=provenance, made_for=_made_for(document.get('made_for')),
         references=None if references is None else parse_readings(references, k),
         gaps=None if gaps is None else parse_gaps(gaps),
-    )
+    )  # fmt: skip
     stated = document.get('fingerprint')
     if stated is not None and str(stated) != model.fingerprint:
         raise ModelFileError(

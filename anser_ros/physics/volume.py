@@ -83,14 +83,15 @@ class TrackedVolume:
     def samples(self, across: int = 6, up: int = 5, part: float = 1.0) -> Array:
         """Return points of the box, shape (across^2 up, 3), m, denser near the board.
 
-        The heights form a geometric series, so the floor must be positive. The points fill a part
-        of the box: its sides and its ceiling are scaled by it.
+        The heights form a geometric series, or an even one where the box reaches below the board.
+        The points fill a part of the box: its sides and its ceiling are scaled by it.
         """
-        floor = self.low[2]
+        floor, top = self.low[2], part * self.ceiling
         x, y = (
             np.linspace(-part, part, across) * reach + middle
             for reach, middle in zip(self.reach, self.middle, strict=True)
         )
-        height = floor * (part * self.ceiling / floor) ** np.linspace(0.0, 1.0, up)
+        share = np.linspace(0.0, 1.0, up)
+        height = floor * (top / floor) ** share if floor > 0 else floor + (top - floor) * share
         x, y, z = np.meshgrid(x, y, height, indexing='ij')
         return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)

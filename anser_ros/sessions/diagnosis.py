@@ -4,7 +4,7 @@ Each stage can be called alone: `prepare`, `correct`, `problem_of`, `diagnosis.d
 `held_out_part`, `track_held_out`; `diagnose_session` runs all of them.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
@@ -13,13 +13,16 @@ import numpy as np
 
 from anser_ros import extensions
 from anser_ros.arrays import Array
-from anser_ros.diagnosis.diagnose import SCHEMA, Diagnosis, diagnose
-from anser_ros.diagnosis.problem import Problem, Spread, build_problem, test_blocks
+from anser_ros.diagnosis.diagnose import SCHEMA, WIRING_FRAMES, Diagnosis, diagnose, screen
+from anser_ros.diagnosis.problem import Problem, Spread, build_problem, test_blocks, train_blocks
+from anser_ros.diagnosis.search import SearchSettings
+from anser_ros.diagnosis.wiring import wiring_faults
+from anser_ros.effects.effect import Term, effect_named
 from anser_ros.errors import DiagnosisError, ParameterError
-from anser_ros.field.model import EffectRecord, FieldModel, plain
+from anser_ros.field.model import SESSION, EffectRecord, FieldModel, plain
 from anser_ros.parallel import in_order
 from anser_ros.sessions.follower import ModelFollower
-from anser_ros.sessions.prepared import PreparedSession, correct, prepare
+from anser_ros.sessions.prepared import PreparedSession, correct, each_stand, prepare
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import date_drifts, made_for
 from anser_ros.sessions.tracked_session import track
@@ -28,6 +31,11 @@ from anser_ros.tracking.estimate import TrackerSettings
 ROOM = 2.0
 """Gate of the held-out part's tracking over its residual: less would refuse a wrong model's poses
 instead of counting them, much more would take wrong minima for poses."""
+
+
+STAND_FRAMES = 90
+"""Frames of each tool, about, by which it is told which of a model's sessions a session stands
+like: a dozen parameters take tens, and twice as many take twice the time."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +75,12 @@ def diagnose_session(
     say = progress or (lambda text: None)
     prepared = prepare(session, model, baseline)
     problem = problem_of(correct(prepared))
+    plugs = wiring_faults(problem.thinned(WIRING_FRAMES))
+    ways = [prepare(session, one, baseline) for one in each_stand(model)] or [prepared]
+    tried = [(way, problem_of(correct(way, plugs))) for way in ways]
+    differing = {effect.name for effect in model.effects if SESSION in effect.parameters}
+    if differing or plugs:
+        prepared, problem = min(tried, key=lambda pair: _left(pair[1], differing))
     found = diagnose(problem, prepared.model, progress=say)
     dated = date_drifts(found.model, session)
     found = replace(found, model=made_for(dated, session.setup))
@@ -74,6 +88,18 @@ def diagnose_session(
     unseen = prepared.with_session(held_out_part(session, problem))
     before, after = track_held_out(unseen, found)
     return SessionDiagnosis(found, before, after)
+
+
+def _left(problem: Problem, differing: Collection[str]) -> float:
+    """Misfit of a problem's wiring, and at most one of these effects, by which sessions differ.
+
+    What stands elsewhere than in any session of a model must not choose another of them.
+    """
+    screened = screen(problem)
+    fitter = SearchSettings().fitter(screened.training(STAND_FRAMES), train_blocks())
+    sites = [effect_named(name).candidates(problem.apparatus) for name in differing]
+    alone: list[tuple[Term, ...]] = [(), *((term,) for terms in sites for term in terms)]
+    return min(fitter.fit([*screened.known, *terms]).misfit for terms in alone)
 
 
 def problem_of(corrected: PreparedSession, spread: Spread | None = None) -> Problem:
@@ -88,13 +114,9 @@ def problem_of(corrected: PreparedSession, spread: Spread | None = None) -> Prob
             f'{session.path}: a diagnosis needs tool fluxes, the session has none'
         )
     return build_problem(
-        session.tools,
-        session.reference,
-        None if clean is None else clean.flux,
-        corrected.model,
-        corrected.nominal.model,
-        spread or spread_of(corrected),
-    )
+        session.tools, session.reference, None if clean is None else clean.flux, corrected.model,
+        corrected.nominal.model, spread or spread_of(corrected),
+    )  # fmt: skip
 
 
 def spread_of(prepared: PreparedSession) -> Spread:

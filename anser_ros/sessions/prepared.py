@@ -1,13 +1,14 @@
 """Works out once what follows from a session and a model, after checking that they fit."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from anser_ros.calibration.readings import with_pose
 from anser_ros.calibration.result import residuals
-from anser_ros.effects.correction import Correction
-from anser_ros.effects.effect import effect_named
+from anser_ros.effects.correction import Correction, coils_read
+from anser_ros.effects.effect import Term, effect_named
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import SESSION, FieldModel
 from anser_ros.physics.rotations import rotation_of_vector
@@ -51,12 +52,8 @@ class PreparedSession:
     def with_model(self, model: FieldModel) -> 'PreparedSession':
         """Return the same with another model; raises `ModelFileError` when it does not fit."""
         check_fits(model, self.session)
-        return replace(
-            self,
-            model=model,
-            correction=_correction(model, self.session),
-            recorded_drift=is_recorded(model, self.session),
-        )
+        correction, recorded = _correction(model, self.session), is_recorded(model, self.session)
+        return replace(self, model=model, correction=correction, recorded_drift=recorded)
 
 
 def prepare(
@@ -79,16 +76,17 @@ def prepare(
         if session.reference is not None:
             flux = clean_flux(baseline, session.reference.sensors, model)
             clean = Baseline(baseline.path, flux)
+    setup, volume = session.setup, tracked_volume(session.setup)
     return PreparedSession(
-        session,
-        model,
-        NominalBoard.of(session.setup),
-        measured_noise(session.setup),
-        tracked_volume(session.setup),
-        clean,
-        _correction(model, session),
-        is_recorded(model, session),
-    )
+        session, model, NominalBoard.of(setup), measured_noise(setup), volume, clean,
+        _correction(model, session), is_recorded(model, session),
+    )  # fmt: skip
+
+
+def each_stand(model: FieldModel) -> list[FieldModel]:
+    """Return a model of several sessions as it was in each, where it knows a difference."""
+    names = dict.fromkeys(filter(None, (e.parameters.get(SESSION) for e in model.effects)))
+    return [_stood(model, name) for name in names]
 
 
 def as_it_stood(model: FieldModel, session: Session) -> FieldModel:
@@ -97,16 +95,15 @@ def as_it_stood(model: FieldModel, session: Session) -> FieldModel:
     That one leaves least of the fluxes at the session's poses. Without any, and where the model
     knows no such difference, it stands in between, as it was written.
     """
-    every = list(dict.fromkeys(filter(None, (e.parameters.get(SESSION) for e in model.effects))))
     tools = [tool for tool in map(with_pose, session.tools) if len(tool.time)]
-    if not every or not tools:
+    if not tools:
         return model
 
     def left(one: FieldModel) -> float:
         how = _correction(one, session), is_recorded(one, session)
         return residuals([_corrected(*how, tool) for tool in tools], one).unexplained
 
-    return min((_stood(model, name) for name in every), key=left)
+    return min(each_stand(model), key=left, default=model)
 
 
 def _stood(model: FieldModel, name: str) -> FieldModel:
@@ -128,27 +125,30 @@ def _correction(model: FieldModel, session: Session) -> Correction:
     return Correction.of(model.effects, session.sensors, model.frequencies_hz)
 
 
-def correct(prepared: PreparedSession) -> PreparedSession:
+def correct(prepared: PreparedSession, plugs: Sequence[Term] = ()) -> PreparedSession:
     """Return the session as the effects that the model knows already leave it.
 
     Fluxes are those that ideal sensors and emitters would have given, sensors are where they
-    truly are, and optical poses are on the fluxes' clock and in the frame fg.
+    truly are, and optical poses are on the fluxes' clock and in the frame fg. ``plugs``: what is
+    exchanged in this session; it stays so.
     """
     session = prepared.session
     how = prepared.correction, prepared.recorded_drift
-    tools = tuple(_corrected(*how, tool) for tool in session.tools)
+    tools = tuple(_corrected(*how, tool, plugs) for tool in session.tools)
     reference = session.reference
     if reference is not None:
         reference = _corrected(*how, reference)
     return prepared.with_session(replace(session, tools=tools, reference=reference))
 
 
-def _corrected(correction: Correction, recorded: bool, measurements: Measurements) -> Measurements:
+def _corrected(
+    correction: Correction, recorded: bool, measurements: Measurements, plugs: Sequence[Term] = ()
+) -> Measurements:
     flux = measurements.flux
     if not correction.terms:
         return measurements
     if correction.changes_flux:
-        channels = measurements.sensors.channel
+        channels = coils_read(plugs, measurements.sensors.channel)
         rows = zip(measurements.time.tolist(), flux, strict=True)
         flux = np.array(
             [correction.flux(time, channels, frame, recorded=recorded) for time, frame in rows]
