@@ -127,7 +127,8 @@ def change_without_gains(now: ComplexArray, before: ComplexArray) -> Array:
     relative = np.zeros(len(new))
     for _ in range(STRENGTH_STEPS if len(new) else 0):
         across = weight[:, None] / size[:, None] ** 2
-        gain = (across * old.conj() * new).sum(axis=0) / (across * np.abs(old) ** 2).sum(axis=0)
+        power = (across * np.abs(old) ** 2).sum(axis=0)
+        gain = (across * old.conj() * new).sum(axis=0) / np.maximum(power, 1e-300)
         relative = np.linalg.norm(new - gain * old, axis=1) / size
         weight = 1.0 / np.maximum(relative, np.median(relative) / 3.0 + 1e-12)
     change[known] = relative
