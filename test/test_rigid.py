@@ -304,3 +304,15 @@ def test_without_a_check_a_pose_that_goes_on_is_as_uncertain_as_a_misfit():
         assert found.state == 'ok' and found.checks == (3 if stamp_ns < 4 else 0), found.reason
         sigma.append(found.sigma_position_m)
     assert min(sigma[3:]) > 4.0 * max(sigma[:3]), sigma
+
+
+def test_without_a_check_a_single_point_has_no_pose():
+    """No motion contradicts what is recorded one by one, wherever the pose before it was."""
+    tool, rng = TOOL.select([0, 1, 2]), np.random.default_rng(SEED)
+    tracker = Tracker(few(3), tool, TrackerSettings(flux_noise_t=NOISE_T))
+    for stamp_ns in range(1, 9):
+        position, rotation = np.array([0.005 * stamp_ns, -0.02, 0.12]), np.eye(3)
+        flux = fluxes(few(3), tool, position, rotation, rng)
+        flux[2] = np.nan if stamp_ns % 2 else flux[2]
+        found = tracker.update(stamp_ns * 9 * 10**8, tool.channel, flux)[-1]
+        assert found.state == ('ambiguous' if stamp_ns % 2 else 'ok'), found.reason

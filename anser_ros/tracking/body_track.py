@@ -8,7 +8,7 @@ import numpy as np
 from anser_ros import pose_states as states
 from anser_ros.arrays import Array, Integers
 from anser_ros.errors import TrackingError
-from anser_ros.integrity.pose_checks import is_part
+from anser_ros.integrity.pose_checks import STREAM_GAP_S, is_part
 from anser_ros.stamps import NANO
 from anser_ros.tracking import body_step, rigid
 from anser_ros.tracking.body_step import UNKNOWNS
@@ -212,8 +212,11 @@ def _follow(track: BodyTrack, frame: BodyFrame) -> tuple[BodyFit | None, PoseEst
     """The fit near the last good pose, if there is one, and its estimate if it is sound."""
     whole, coils, context, stamp_ns = frame.usable, frame.coils, frame.context, frame.stamp_ns
     tries, last_ns, fit = [whole], int(track.memory.last[0]), None
-    if not last_ns or (stamp_ns - last_ns) * NANO > frame.settings.warm_age_s:
+    age_s = (stamp_ns - last_ns) * NANO
+    if not last_ns or age_s > frame.settings.warm_age_s:
         return None, None
+    if age_s > STREAM_GAP_S and frame.freedom(whole).checks <= 0:
+        return None, None  # neither a reading nor a motion is left to contradict the pose
     if track.left_out and stamp_ns < track.again_ns:
         kept = np.array([i for i in whole.tolist() if i not in track.left_out], dtype=np.int64)
         if len(kept) > 1 and coils.subset(kept).observable:
