@@ -127,7 +127,8 @@ class TestWriteSession:
         np.testing.assert_allclose(tool.time, times - times[0], atol=1e-9)
         np.testing.assert_allclose(tool.position, given[1], atol=1e-12)
         assert tool.valid[:, 0].tolist() == [True, True, False, True]
-        assert session.lost == 'fluxes of pen are missing or not finite in 1 of 4 frames, left out'
+        words = 'fluxes of pen are missing or not finite in 1 of 4 frames'
+        assert session.lost == f'{words}; these readings are not used'
 
     def test_a_setup_of_numpy_s_numbers_is_one_of_python_s(self, tmp_path):
         setup = {**SETUP, 'flux_rate_hz': np.float64(50.0)}

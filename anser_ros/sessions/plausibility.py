@@ -305,8 +305,8 @@ def _missing(tool: Measurements) -> list[str]:
     names = ', '.join(name for name, gone in zip(tool.sensors.name, dead, strict=True) if gone)
     words = [f'no reading of {names}'] if names else []
     if lacking:
-        count = f'{lacking} of {len(read)} frames'
-        words.append(f'fluxes of {tool.body} are missing or not finite in {count}, left out')
+        count = f'{lacking} of {len(read)} frames; these readings are not used'
+        words.append(f'fluxes of {tool.body} are missing or not finite in {count}')
     return words
 
 
