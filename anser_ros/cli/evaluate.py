@@ -16,7 +16,7 @@ from anser_ros.cli import page as html
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
-from anser_ros.pose_states import AMBIGUOUS, OK, RESIDUAL
+from anser_ros.pose_states import OK, RESIDUAL
 from anser_ros.sessions.follower import parse_references, with_references
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import (
@@ -303,8 +303,7 @@ def why_withheld(model: FieldModel, evaluation: Evaluation) -> tuple[str, ...]:
     found = Counter(pose.state for pose in poses)
     worst, count = max(found.items(), key=lambda one: (one[0] != OK, one[1]), default=(OK, 0))
     is_other = worst == RESIDUAL and known and 2 * count > len(poses)
-    hides = of_bodies and worst == AMBIGUOUS  # few emitters leave it to the body
-    if worst == OK or hides or (found[OK] > HARDLY * len(poses) and not is_other):
+    if worst == OK or (found[OK] > HARDLY * len(poses) and not is_other):
         return ()
     whose = 'most poses of single coils are' if of_bodies else 'most poses are'
     reasons = [pose.reason for pose in poses if pose.state == worst and pose.reason]

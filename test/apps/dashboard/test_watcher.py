@@ -252,7 +252,7 @@ def test_fluxes_of_another_frame_are_counted_and_not_looked_at(ros, moving):
             if frame_id == 'world':
                 assert streams.window.session() is None
                 assert node.counters['fluxes_other_frame_id'] == 2
-                assert "fluxes in the frame 'world'" in node._trouble
+                assert "fluxes in the frame 'world'" in node._trouble.last
         assert node.counters['frames'] == node.counters['fluxes_refused'] == 2
         assert streams.window.session() is not None
     finally:
@@ -279,4 +279,4 @@ def test_a_baseline_that_is_none_is_refused(start):
     """Said in one line, before anything runs."""
     watcher = start('watcher', '--ros-args', '-p', 'baseline_file:=nowhere.mcap')
     assert watcher.wait() == 2
-    assert 'no such bag' in watcher.output
+    assert 'baseline_file: no file nowhere.mcap' in watcher.output

@@ -85,7 +85,7 @@ def test_a_defect_of_one_session_is_its_row_with_the_traceback(tmp_path):
             raise BagError('bad: no bag')
         raise ZeroDivisionError('of mine')
 
-    args = argparse.Namespace(sessions=['bad', 'worse'], out=tmp_path)
+    args = argparse.Namespace(sessions=['bad', 'worse'], out=tmp_path, poses=False)
     result = on_each('evaluate', work, args, lambda *_: None)
     bad, worse = result.document['sessions']
     assert bad['message'] == 'bad: no bag' and result.code == EXIT_DEFECT
