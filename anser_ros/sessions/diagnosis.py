@@ -76,10 +76,10 @@ def diagnose_session(
     prepared = prepare(session, model, baseline)
     problem = problem_of(correct(prepared))
     plugs = wiring_faults(problem.thinned(WIRING_FRAMES))
-    ways = [prepare(session, one, baseline) for one in each_stand(model)] or [prepared]
-    tried = [(way, problem_of(correct(way, plugs))) for way in ways]
     differing = {effect.name for effect in model.effects if SESSION in effect.parameters}
     if differing or plugs:
+        ways = [prepare(session, one, baseline) for one in each_stand(model)] or [prepared]
+        tried = [(way, problem_of(correct(way, plugs))) for way in ways]
         prepared, problem = min(tried, key=lambda pair: _left(pair[1], differing))
     found = diagnose(problem, prepared.model, progress=say)
     dated = date_drifts(found.model, session)

@@ -179,7 +179,7 @@ class PointCloud(NamedTuple):
 
 
 def read_cloud(message: bytes) -> PointCloud:
-    """Read a serialised cloud, a tenth of the work that the middleware's object takes.
+    """Read a serialised cloud, a fifth of the work that the middleware's object takes.
 
     Raises `LayoutError` when it is none, or has more points or fields than a sensible one.
     """
