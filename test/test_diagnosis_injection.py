@@ -96,6 +96,17 @@ def test_nothing_is_named_that_the_model_may_be_wrong_by():
     assert set(changed(gain)) == {'common_gain'}
     assert not changed(gain, flux_t=2e-9)
     assert not changed(gain, gaps_t=2e-9)
+    hit = np.where(np.arange(375)[:, None] % 40, gain, [[1.1, 0.9, 1.0]])
+    assert set(changed(hit, flux_t=6e-9)) == {'outliers'}, 'which are not the model'
+
+
+def test_a_number_of_every_frame_has_the_range_of_its_constant_effect():
+    """Poses of other frames are no emitter that fluctuates by more than itself."""
+    made = world(1, 375, 3)
+    track, late = made.tool.track, np.roll(np.arange(made.tool.track.time.size), 40)
+    made.track(PoseTrack(track.time, track.position[late], track.quaternion[late]))
+    found = diagnose(made.problem(), made.model)
+    assert not found.findings and 'plausible range' in next(c.reason for _, c in found.refused)
 
 
 def test_a_moved_emitter_is_one_fault_where_its_gradient_is_hardly_known():

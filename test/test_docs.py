@@ -14,7 +14,7 @@ from anser_ros.effects.effect import all_effects
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.board import KINDS
 from anser_ros.pose_states import STATES
-from anser_ros.sessions.diagnosis import DEPENDENCIES, document_of, effect_figures
+from anser_ros.sessions.diagnosis import DEPENDENCIES, TrackingErrors, document_of, effect_figures
 from anser_ros.sessions.starting_model import board_of
 from anser_ros.wire.points import flux_fields
 from anser_ros.wire.setup import KEYS
@@ -140,9 +140,9 @@ class TestInterfacesPage:
             assert service in page('interfaces')
 
     def test_every_key_of_a_diagnosis(self):
-        nothing = ((0.0,) * 3, (None,) * 2, (None,) * 2)
+        nothing = ((0.0,) * 3, TrackingErrors(), TrackingErrors())
         effect = effect_figures(EffectRecord('sensor_gain', {}), 0.0)
-        document = document_of(*nothing, [effect], (0.0, []))
+        document = document_of(*nothing, [effect], 0.0, [])
         section = page('interfaces').split('### diagnosis.json')[1].split('\n## ')[0]
         parts = document, document['held_out'], effect, document['unexplained']
         assert {key for part in parts for key in part} <= set(re.findall(r'`(\w+)`', section))

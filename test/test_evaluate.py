@@ -140,8 +140,11 @@ def test_what_all_poses_and_the_reference_have_between_them_is_said(moving):
     turn = np.array([estimate.rotation for estimate in body.estimates])
     quarter = rotation_of_vector(np.array([0.0, 0.5 * np.pi, 0.0]))
 
+    def found(position, rotation):
+        return disagreement('tool', body.estimates, (position, rotation), Accuracy())
+
     def said(position, rotation):
-        return ' '.join(disagreement('tool', body.estimates, (position, rotation), Accuracy()))
+        return ' '.join(one.words for one in found(position, rotation))
 
     assert moving.disagreements == () and said(place, turn) == ''
     assert said(place + [1e-4, 0.0, 0.0], turn) == ''  # three sigma are more
@@ -156,6 +159,16 @@ def test_what_all_poses_and_the_reference_have_between_them_is_said(moving):
     words = said(place[::-1], turn[::-1])
     assert 'no frame, mounting, unit or order of axes explains that' in words
     assert said(np.full_like(place, np.nan), turn) == ''
+    later = said(np.roll(place, 3, axis=0), np.roll(turn, 3, axis=0))
+    assert 'read as stamped 0.12 s late, 0.00 mm' in later
+    shift, small = [0.03, 0.0, 0.0], rotation_of_vector(np.array([0.0, 0.1, 0.0]))
+    for position, rotation, is_stated in (
+        (place + shift, turn, False), (place @ small.T, small @ turn, False),
+        (place @ quarter.T, quarter @ turn, True), (place[:, [1, 0, 2]], turn, True),
+        (place, turn @ quarter, False), (place[::-1], turn[::-1], False),
+    ):  # fmt: skip
+        (one,) = found(position, rotation)
+        assert one.is_gross and one.is_stated is is_stated, one.words
     third = place.copy()
     third[: len(place) // 3] += [0.05, 0.0, 0.0]
     assert f'{len(place) // 3} of {len(place)} by more than 5.00 mm' in said(third, turn)

@@ -3,6 +3,7 @@
 The recordings are those of bags/, written down wrongly in ways that people do.
 """
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -179,6 +180,24 @@ def test_quaternions_that_are_none(moving, tool):
     none = replace(tool, track=None, has_pose=np.zeros_like(tool.has_pose))
     says(moving, none, 'all 7 optical poses', 'unit length', refused={reason: 7})
     assert '7 optical poses' in checked(moving, tool, {reason: 7})[1]
+
+
+def test_a_reference_that_no_effect_explains_is_told_and_no_effect_is_named(moving, tool):
+    """As `evaluate` tells it: before the search, or after it where effects leave it so."""
+    model = load_model(MODEL)
+    turned = with_track(tool, position=tool.track.position[:, [1, 0, 2]])
+    again = with_track(
+        tool, position=tool.track.position[::-1], quaternion=tool.track.quaternion[::-1]
+    )
+    for wrong, words in (
+        (turned, r'read as positions with the axes y, x, z'),
+        (again, 'no frame, mounting, unit or order of axes explains that'),
+    ):
+        session = replace(moving, tools=(wrong,))
+        (one,) = track_session(session, model).disagreements
+        assert words in one.words
+        with pytest.raises(PlausibilityError, match=re.escape(one.words)):
+            diagnose_session(session, model)
 
 
 def test_a_diagnosis_of_one_pose_ends_at_once(moving, tool):

@@ -18,7 +18,7 @@ from anser_ros.cli import output, sessions
 from anser_ros.cli import page as html
 from anser_ros.cli.calibrate import population_figure, population_table
 from anser_ros.cli.diagnosis_words import flux_unit, held_out_rows, short_ones, value_text, verdict
-from anser_ros.diagnosis.problem import Part, State, tool_parts
+from anser_ros.diagnosis.problem import State, tool_parts
 from anser_ros.diagnosis.search import Candidate
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.diagnosis import SessionDiagnosis, diagnose_session, other_way, to_document
@@ -87,19 +87,6 @@ def strongest(state: State) -> str:
     return f'It is largest on {") and on ".join(largest)}).'
 
 
-def _rms(part: Part, axis: int) -> Array:
-    good = part.whitener.weight > 0
-    return np.asarray(
-        np.sqrt((part.white**2 * good).sum(axis=axis) / np.maximum(good.sum(axis=axis), 1))
-    )
-
-
-def _power(part: Part) -> Array:
-    """Mean square of the residual by channel and emitter."""
-    sensors, emitters = part.view.flux.shape[1:]
-    return np.asarray((_rms(part, 0) ** 2).reshape(2, sensors, emitters).mean(axis=0))
-
-
 def time_line(before: State, after: State) -> Figure:
     """Draw the residual of every frame over time, without and with the effects."""
     figure, axes = plt.subplots(figsize=(9, 3), layout='constrained')
@@ -108,10 +95,10 @@ def time_line(before: State, after: State) -> Figure:
         (before, html.BEFORE, 'before', 6), (after, html.AFTER, 'after', 3),
     ):  # fmt: skip
         for part in tool_parts(state):
-            axes.plot(part.view.time, _rms(part, 1), '.', ms=size, color=colour, label=label)
+            axes.plot(part.view.time, part.rms(1), '.', ms=size, color=colour, label=label)
     axes.axhline(1.0, color='0.6', lw=0.8)
     axes.set(xlabel='time, s', ylabel='residual / expected')
-    sizes = np.concatenate([_rms(part, 1) for one in (before, after) for part in tool_parts(one)])
+    sizes = np.concatenate([part.rms(1) for one in (before, after) for part in tool_parts(one)])
     if sizes.max() > html.WIDE * sizes.min():
         axes.set(yscale='log')
         html.spell_out(axes.yaxis)
@@ -122,7 +109,7 @@ def time_line(before: State, after: State) -> Figure:
 def maps(before: State, after: State) -> Figure:
     """Draw the residual of every frame where the tool was, seen from above."""
     figure, panels = plt.subplots(1, 2, figsize=(9, 4), layout='constrained', sharey=True)
-    sizes = [np.concatenate([_rms(part, 1) for part in tool_parts(s)]) for s in (before, after)]
+    sizes = [np.concatenate([part.rms(1) for part in tool_parts(s)]) for s in (before, after)]
     top = max(float(np.percentile(sizes[0], 98)), 1.5)
     for panel, state, size, title in zip(
         panels, (before, after), sizes, ('before', 'after'), strict=True
@@ -180,12 +167,10 @@ def bars(before: State, after: State) -> Figure:
 
 def _by(state: State, axis: str) -> tuple[list[str], Array]:
     """Return the names of all channels or emitters, and the residual of each."""
-    parts = tool_parts(state)
-    if axis == 'channel':
-        names = [str(c) for part in parts for c in part.view.sensors.channel.tolist()]
-        return names, np.sqrt(np.concatenate([_power(part).mean(axis=1) for part in parts]))
-    size = np.sqrt(np.mean([_power(part).mean(axis=0) for part in parts], axis=0))
-    return [str(k) for k in range(len(size))], size
+    power = {c: own for part in tool_parts(state) for c, own in part.power().items()}
+    sizes = np.array(list(power.values())).mean(axis=1 if axis == 'channel' else 0)
+    names = list(power) if axis == 'channel' else list(range(len(sizes)))
+    return [str(name) for name in names], np.sqrt(sizes)
 
 
 MOST_CANDIDATES = 40

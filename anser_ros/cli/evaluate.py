@@ -274,7 +274,7 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     notes = (
         *told,
         *((_few_notes(session) if args.refit else ()) or why),
-        *evaluation.disagreements,
+        *(one.words for one in evaluation.disagreements),
         *((f'emitters differ from the model, tools say: {strengths}',) if strengths else ()),
     )
     return output.Result(document, notes, tuple(shown), tuple(written))

@@ -18,7 +18,7 @@ from anser_ros.diagnosis.fit import Fit, Fitter, settled
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate, parts
 from anser_ros.diagnosis.screening import known_variance, noise_scale
 from anser_ros.effects.base import View
-from anser_ros.effects.effect import INEXACT, Family, Term, all_effects
+from anser_ros.effects.effect import INEXACT, Family, FluctuationTerm, Term, all_effects
 from anser_ros.parallel import in_order
 
 SCALES = np.geomspace(1e-3, 1.0, 7)
@@ -338,7 +338,7 @@ def _checked(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmati
     return Confirmation(
         power, _varying(fit.state, columns, noise) / max(power, 1e-300),
         power / max(left_tools, 1e-300), remainder / max(power, 1e-300),
-        inexact=term.effect.inexact, alike=_crowd(fit, term), plausible=_plausible(fit, term),
+        inexact=term.effect.inexact, alike=_crowd(fit, term), plausible=_plausible(term),
         helps=_helps(without, fit.state, columns),
     )  # fmt: skip
 
@@ -364,10 +364,9 @@ def _singled(term: Term) -> set[int]:
     return set(term.channels) if len(term.channels) <= 2 else set()
 
 
-def _plausible(fit: Fit, term: Term) -> bool:
-    """Whether the record's values are in the effect's ranges."""
-    index = next(i for i, t in enumerate(fit.terms) if t is term)
-    return term.effect.possible(term.effect.record(term, fit.covariance_of(index)))
+def _plausible(term: Term) -> bool:
+    """Whether a term's record has values in its effect's ranges."""
+    return term.effect.possible(term.effect.record(term, np.zeros((term.theta.size,) * 2)))
 
 
 def _stays(state: State, columns: Sequence[Array | None], noise: float, expected: float) -> float:
@@ -407,7 +406,7 @@ def _stays(state: State, columns: Sequence[Array | None], noise: float, expected
     return stays if stays > decisions.LEAST_POWER_SIGMAS * spread * np.sqrt(acted.size) else 0.0
 
 
-def _checked_open(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmation:
+def _checked_open(problem: Problem, fit: Fit, term: FluctuationTerm, noise: float) -> Confirmation:
     """Check a fluctuation: its likelihood speaks for it, unless much stays where it acts."""
     without = evaluate(problem, [t for t in fit.terms if t is not term])
     power = max(without.sum_of_squares - fit.state.sum_of_squares, 1e-300)
@@ -416,16 +415,15 @@ def _checked_open(problem: Problem, fit: Fit, term: Term, noise: float) -> Confi
         raw = term.effect.directions(term, part.view)
         columns.append(None if raw is None else parts(raw) * part.whitener.weight[..., None])
     stays = _stays(fit.state, columns, noise, noise) / power
-    return Confirmation(
-        power, 0.0, np.inf, stays, inexact=term.effect.inexact, alike=_crowd(fit, term)
-    )
+    inexact, plausible = term.effect.inexact, all(map(_plausible, term.extremes))
+    return Confirmation(power, 0.0, np.inf, stays, inexact, _crowd(fit, term), plausible)
 
 
 def doubtful(problem: Problem, fit: Fit) -> list[tuple[Confirmation, Term]]:
     """Return a fit's effects that are not confirmed, the one with the least power first."""
     noise, white = known_variance(fit.state), noise_scale(fit.state) ** 2
     fitted = [term for term in fit.effects if term.theta.size]
-    free = [term for term in fit.terms if term.effect.family is Family.FLUCTUATION]
+    free = [one for term in fit.terms if (one := term.effect.opened(term)) is not None]
     checks = [(_checked(problem, fit, term, noise), term) for term in fitted]
     checks += [(_checked_open(problem, fit, term, white), term) for term in free]
     checks += _unsteady(problem, fit)

@@ -210,9 +210,10 @@ KNOWN_SIGMAS = 3.0
 """Standard deviations by which a share of frames may exceed the one that the model knows of, which
 chance alone does in one session of 700."""
 MOST_EXCESS_OF_OUTLIERS = 0.3
-"""Unexplained power over the floor's up to which frames that stand out are outliers: a model that
-is wrong by more makes some itself. Larger names outliers that are another effect's, and with no
-bound a hum; smaller leaves true ones unnamed if there is a small unknown (`docs/log.md`)."""
+"""Unexplained power, over that of noise and of the error that the model states, up to which frames
+that stand out are outliers: a model that is wrong by more makes some itself. Larger names outliers
+that are another effect's, and with no bound a hum; smaller leaves true ones unnamed if there is a
+small unknown (`docs/log.md`)."""
 
 # Each of the next four lies above all that normal noise reached in 200 draws of 100 frames with 48
 # readings, the fewest of a watch on two clusters and four coils; more frames or readings reach

@@ -106,10 +106,8 @@ def departure(problem: Problem, rest_s: float) -> Departure | None:
 
 def _power(state: State) -> float:
     """Mean whitened square of the median frame of the tools and references."""
-    each = [np.sum(part.white**2, axis=1) for part in state.parts]
-    count = [np.count_nonzero(part.whitener.weight, axis=1) for part in state.parts]
-    used = np.concatenate(count)
-    return float(np.median(np.concatenate(each)[used > 0] / used[used > 0]))
+    each = np.concatenate([part.rms(1)[part.whitener.weight.any(axis=1)] for part in state.parts])
+    return float(np.median(each**2))
 
 
 def _best_starts(

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from anser_ros.arrays import Array, Integers
+from anser_ros.arrays import Integers
 from anser_ros.diagnosis import decisions, screening
 from anser_ros.diagnosis.choice import Confirmation, doubtful, refit_spreads
 from anser_ros.diagnosis.fit import FINE, Fit, Fitter, settled
@@ -69,16 +69,12 @@ def plain_finding(term: Term, without: float) -> Finding:
 
 
 def outlier_findings(
-    whole: Problem,
-    cleaned: Problem,
-    after: State,
-    excess: float,
-    known: Sequence[EffectRecord] = (),
+    whole: Problem, cleaned: Problem, after: State, excess: float, known: Sequence[EffectRecord]
 ) -> list[Finding]:
     """Return outliers or a loose contact, where frames stand out and nothing else makes them.
 
     ``whole`` and ``cleaned``: with and without the frames that stand out; ``after``: the held-out
-    part with all effects; ``excess``: power that is not explained, over the floor's; ``known``:
+    part with all effects; ``excess``: power that is not explained, over what is known; ``known``:
     the model's effects. Frames that stood out in its own scan are what the tracker always does.
     """
     share, channels = screening.outlying_share(whole, cleaned)
@@ -99,19 +95,14 @@ def noise_findings(whole: Problem, after: State) -> list[Finding]:
     factor = screening.noise_t(after) / whole.spread.noise_t
     if factor <= decisions.LEAST_NOISE_GROWTH:
         return []
-    squares: dict[int, Array] = {}
-    for part in tool_parts(after):
-        square = part.white**2 * (part.whitener.weight > 0)
-        cells = square.reshape(-1, 2, *part.view.flux.shape[1:])
-        for row, channel in enumerate(part.view.sensors.channel.tolist()):
-            squares[channel] = cells[:, :, row]
-    noisy = [c for c, values in squares.items() if values.mean() > decisions.LEAST_NOISE_GROWTH**2]
-    if len(noisy) == len(squares):  # where no others have none, it is that of all
+    power = {c: own.mean() for part in tool_parts(after) for c, own in part.power().items()}
+    noisy = [c for c, own in power.items() if own > decisions.LEAST_NOISE_GROWTH**2]
+    if len(noisy) == len(power):  # where no others have none, it is that of all
         noisy = []
     count: float = after.count
     if noisy:
-        size = np.sqrt(np.mean(np.concatenate([squares[c].ravel() for c in noisy])))
-        factor = float(size) * whole.spread.flux_t / whole.spread.noise_t
+        size = float(np.sqrt(np.mean([power[c] for c in noisy])))
+        factor = size * whole.spread.flux_t / whole.spread.noise_t
         count *= len(noisy) / len(whole.apparatus.tool_channels)
     sigma = factor / np.sqrt(2 * max(count, 1))
     return [plain_finding(EXCESS_NOISE.seen(factor, sigma, tuple(noisy)), rms(after))]
@@ -310,7 +301,8 @@ def conclude(
         for i, term in enumerate(fit.terms)
         if term.effect.family is not Family.REMAINDER
     ]
-    findings += outlier_findings(whole, cleaned, after, excess / floor**2, model.effects)
+    own = rms(after) ** 2 / max(floor, expected) ** 2 - 1.0
+    findings += outlier_findings(whole, cleaned, after, own, model.effects)
     if not significant:
         findings += noise_findings(whole, after)
     records = [finding.record for finding in findings]

@@ -219,6 +219,17 @@ class Part:
         """Return the number of values that have a weight."""
         return int(np.count_nonzero(self.whitener.weight))
 
+    def rms(self, axis: int) -> Array:
+        """Return the root mean square of what counts of each frame (axis 1) or value (0)."""
+        good = self.whitener.weight > 0
+        power = (self.white**2 * good).sum(axis=axis) / np.maximum(good.sum(axis=axis), 1)
+        return np.asarray(np.sqrt(power))
+
+    def power(self) -> dict[int, Array]:
+        """Return the mean square of each channel's residuals, by emitter, (K,)."""
+        power = (self.rms(0) ** 2).reshape(2, *self.view.flux.shape[1:]).mean(axis=0)
+        return dict(zip(self.view.sensors.channel.tolist(), power, strict=True))
+
     def frames(self, rows: Integers) -> 'Part':
         """Return the part of some frames, chosen by index."""
         return Part(

@@ -195,6 +195,13 @@ class FluctuationTerm(Term):
         """Return each parameter's standard deviation by the constant effect, shape (q,)."""
         return np.zeros(0) if self.constant is None else self.constant.effect.prior(self.constant)
 
+    @property
+    def extremes(self) -> list[Term]:
+        """Return the constant effect a deviation up and down, where both are known."""
+        if self.constant is None or self.spread is None:
+            return []
+        return [self.constant.with_theta(sign * self.spread) for sign in (-1.0, 1.0)]
+
 
 TermT = TypeVar('TermT', bound=Term)
 SizedShapes = tuple[Shapes, Sequence[Array]]

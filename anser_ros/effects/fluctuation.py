@@ -29,7 +29,6 @@ class Fluctuation(Effect[FluctuationTerm]):
     """Lets a constant effect, along whose columns a frame may move, fluctuate."""
 
     family = Family.FLUCTUATION
-    plausible = {'rms': (0.0, 1.0)}
 
     def __init__(self, of: Effect[Any], name: str, summary: str, units: Mapping[str, str]) -> None:
         self.of, self.name, self.summary, self.units = of, name, summary, units

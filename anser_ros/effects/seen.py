@@ -93,11 +93,8 @@ class SeenEffect(Effect[SeenTerm]):
 
     family = Family.SEEN
 
-    def __init__(
-        self, name: str, summary: str, units: Mapping[str, str], plausible: tuple[float, float]
-    ) -> None:
+    def __init__(self, name: str, summary: str, units: Mapping[str, str]) -> None:
         self.name, self.summary, self.units, self._key = name, summary, units, next(iter(units))
-        self.plausible = {self._key: plausible}
 
     def record(self, term: SeenTerm, covariance: Array) -> EffectRecord:
         parameters = {self._key: term.amount, **term.recorded_site}
@@ -114,10 +111,10 @@ class SeenEffect(Effect[SeenTerm]):
 
 EXCESS_NOISE = SeenEffect(
     'excess_noise', 'the noise is larger than it should be, and nothing else',
-    {'factor': '1', 'channels': '1'}, (1.0, 1000.0),
+    {'factor': '1', 'channels': '1'},
 )  # fmt: skip
 OUTLIERS, LOOSE_CONTACT = (
-    SeenEffect(name, summary, {'fraction': '1', 'channels': '1'}, (0.0, 0.5))
+    SeenEffect(name, summary, {'fraction': '1', 'channels': '1'})
     for name, summary in (
         ('outliers', 'some frames fit no model'),
         ('loose_contact', 'single readings of a channel fail now and then'),

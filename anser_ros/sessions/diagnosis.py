@@ -6,19 +6,19 @@ Each stage can be called alone: `prepare`, `correct`, `problem_of`, `diagnosis.d
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from functools import partial
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from anser_ros import extensions
-from anser_ros.arrays import Array
 from anser_ros.diagnosis.diagnose import SCHEMA, WIRING_FRAMES, Diagnosis, diagnose, screen
 from anser_ros.diagnosis.problem import Problem, Spread, build_problem, test_blocks, train_blocks
 from anser_ros.diagnosis.search import SearchSettings
 from anser_ros.diagnosis.wiring import wiring_faults
 from anser_ros.effects.effect import Term, effect_named
-from anser_ros.errors import DiagnosisError, ParameterError
+from anser_ros.errors import DiagnosisError, ParameterError, PlausibilityError
 from anser_ros.field.model import SESSION, EffectRecord, FieldModel, plain
 from anser_ros.parallel import in_order
 from anser_ros.sessions.follower import ModelFollower
@@ -46,8 +46,8 @@ class TrackingErrors:
     pose; None where nothing was tracked.
     """
 
-    position_rmse_m: float | None
-    orientation_rmse_rad: float | None
+    position_rmse_m: float | None = None
+    orientation_rmse_rad: float | None = None
 
 
 @dataclass(frozen=True)
@@ -69,13 +69,18 @@ def diagnose_session(
 
     With a baseline, a distortion-free recording of the same board, the references are used.
     ``progress`` is called with words on what goes on. Raises `DiagnosisError` when fewer than 30
-    frames have fluxes and a pose; `ModelFileError` when the model's emitters are not the
-    session's; `BagError` when the baseline's references are not the session's.
+    frames have fluxes and a pose; `PlausibilityError` when the optical poses are grossly off the
+    tracked ones, and no effect is that or mends it; `ModelFileError` when the model's emitters are
+    not the session's; `BagError` when the baseline's references are not the session's.
     """
     say = progress or (lambda text: None)
     prepared = prepare(session, model, baseline)
     problem = problem_of(correct(prepared))
     plugs = wiring_faults(problem.thinned(WIRING_FRAMES))
+    gross = [] if plugs else [one for one in track(prepared).disagreements if one.is_gross]
+    for one in gross:
+        if one.is_stated:
+            raise PlausibilityError(one.words)
     differing = {effect.name for effect in model.effects if SESSION in effect.parameters}
     if differing or plugs:
         ways = [prepare(session, one, baseline) for one in each_stand(model)] or [prepared]
@@ -84,6 +89,9 @@ def diagnose_session(
     found = diagnose(problem, prepared.model, progress=say)
     dated = date_drifts(found.model, session)
     found = replace(found, model=made_for(dated, session.setup))
+    left = track(prepared.with_model(found.model)).disagreements if gross else ()
+    if any(one.is_gross for one in left):
+        raise PlausibilityError(gross[0].words)
     say('tracking the held-out part')
     unseen = prepared.with_session(held_out_part(session, problem))
     before, after = track_held_out(unseen, found)
@@ -153,45 +161,30 @@ def track_held_out(
     """
     floor = max(found.flux_rms_floor_t, 1e-30)
     after = unseen.with_model(found.model)
-    moves = any(term.effect.followed for term in found.terms)
-
-    def with_effects() -> TrackingErrors:
-        follower = ModelFollower(after) if moves and after.baseline is not None else None
-        return _errors(after, found.flux_rms_after_t / floor, follower)
-
-    def without() -> TrackingErrors:
-        return _errors(unseen, found.flux_rms_before_t / floor)
-
+    moves = any(term.effect.followed for term in found.terms) and after.baseline is not None
+    with_effects = partial(_errors, after, found.flux_rms_after_t / floor, moves)
+    without = partial(_errors, unseen, found.flux_rms_before_t / floor, False)
     later, earlier = in_order(lambda work: work(), [with_effects, without])
     return earlier, later
 
 
-def _errors(
-    prepared: PreparedSession, misfit: float, follower: ModelFollower | None = None
-) -> TrackingErrors:
+def _errors(prepared: PreparedSession, misfit: float, moves: bool) -> TrackingErrors:
     """Errors with a gate as wide as the misfit: a wrong model's poses are to be seen here."""
-    usual = TrackerSettings()
-    settings = replace(usual, gate=usual.gate * max(1.0, ROOM * misfit))
-    evaluation = track(prepared, settings, follower)
+    settings = TrackerSettings(gate=TrackerSettings().gate * max(1.0, ROOM * misfit))
+    evaluation = track(prepared, settings, ModelFollower(prepared) if moves else None)
     # Where no coil has a pose (a field that is the same all around an axis), the source has; where
     # one coil alone cannot have one (over few emitters), its body has.
     further = [one for group in evaluation.further.values() for one in group.values()]
     kinds = (further or list(evaluation.sensors.values())), list(evaluation.bodies.values())
-    # The first frame of a held-out part is there for its stamp alone.
-    errors = [
-        TrackingErrors(
-            _rms([one.position_error[1:] for one in series]),
-            _rms([one.orientation_error[1:] for one in series]),
-        )
-        for series in kinds
-    ]
+    errors = []
+    for series in kinds:
+        # The first frame of a held-out part is there for its stamp alone.
+        pairs = [np.array([one.position_error, one.orientation_error])[:, 1:] for one in series]
+        rows = np.concatenate([np.zeros((2, 0)), *pairs], axis=1)
+        each = [row[np.isfinite(row)] for row in rows]
+        rms = [float(np.sqrt(np.mean(e**2))) if e.size else None for e in each]
+        errors.append(TrackingErrors(*rms))
     return next((e for e in errors if e.position_rmse_m is not None), errors[0])
-
-
-def _rms(errors: list[Array]) -> float | None:
-    values = np.concatenate([np.zeros(0), *errors])
-    values = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(values**2))) if values.size else None
 
 
 DEPENDENCIES = (
@@ -205,41 +198,27 @@ MODEL_FILE_ONLY = ('groups', 'knots_s', 'course', 'couplings_m3')
 def to_document(result: SessionDiagnosis) -> dict[str, Any]:
     """Return what was found as plain data."""
     found, before, after = result.diagnosis, result.before, result.after
-    return document_of(
-        (found.flux_rms_before_t, found.flux_rms_after_t, found.flux_rms_floor_t),
-        (before.position_rmse_m, after.position_rmse_m),
-        (before.orientation_rmse_rad, after.orientation_rmse_rad),
-        [effect_figures(one.record, one.flux_rms_without_t) for one in found.findings],
-        (found.unexplained, [name for name in found.depends_on if name in DEPENDENCIES]),
-    )
+    flux_t = found.flux_rms_before_t, found.flux_rms_after_t, found.flux_rms_floor_t
+    effects = [effect_figures(one.record, one.flux_rms_without_t) for one in found.findings]
+    depends_on = [name for name in found.depends_on if name in DEPENDENCIES]
+    return document_of(flux_t, before, after, effects, found.unexplained, depends_on)
 
 
 def document_of(
-    flux_t: tuple[float, float, float],
-    position_m: tuple[float | None, float | None],
-    orientation_rad: tuple[float | None, float | None],
-    effects: list[dict[str, Any]],
-    unexplained: tuple[float, list[str]],
-) -> dict[str, Any]:
+    flux_t: tuple[float, float, float], before: TrackingErrors, after: TrackingErrors,
+    effects: list[dict[str, Any]], unexplained: float, depends_on: list[str],
+) -> dict[str, Any]:  # fmt: skip
     """Return the document of errors before and after, of effects, and of what is unexplained.
 
-    Of fluxes there is the error of noise alone too; the last are the share that is unexplained,
-    and what that depends on.
+    Of fluxes there is the error of noise alone too.
     """
-    return {
-        'schema': SCHEMA,
-        'held_out': {
-            'flux_rms_before_t': flux_t[0],
-            'flux_rms_after_t': flux_t[1],
-            'flux_rms_floor_t': flux_t[2],
-            'position_rmse_before_m': position_m[0],
-            'position_rmse_after_m': position_m[1],
-            'orientation_rmse_before_rad': orientation_rad[0],
-            'orientation_rmse_after_rad': orientation_rad[1],
-        },
-        'effects': effects,
-        'unexplained': {'fraction': unexplained[0], 'depends_on': unexplained[1]},
-    }
+    keys = ('flux_rms_before_t', 'flux_rms_after_t', 'flux_rms_floor_t')
+    held_out: dict[str, float | None] = dict(zip(keys, flux_t, strict=True))
+    for when, errors in (('before', before), ('after', after)):
+        held_out[f'position_rmse_{when}_m'] = errors.position_rmse_m
+        held_out[f'orientation_rmse_{when}_rad'] = errors.orientation_rmse_rad
+    rest = {'fraction': unexplained, 'depends_on': depends_on}
+    return {'schema': SCHEMA, 'held_out': held_out, 'effects': effects, 'unexplained': rest}
 
 
 def effect_figures(record: EffectRecord, without_t: float) -> dict[str, Any]:

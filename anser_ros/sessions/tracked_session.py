@@ -23,7 +23,7 @@ from anser_ros.fingerprint import fingerprint_of
 from anser_ros.physics.rotations import axis_angles, rotation_angles
 from anser_ros.pose_states import OK
 from anser_ros.sessions.baseline import check_place
-from anser_ros.sessions.disagreement import disagreement
+from anser_ros.sessions.disagreement import Disagreement, disagreement
 from anser_ros.sessions.follower import ModelFollower, RefitSummary
 from anser_ros.sessions.prepared import PreparedSession, prepare, with_truth
 from anser_ros.sessions.session import Session, frames_of, settings_for
@@ -91,12 +91,12 @@ def track(
                     further[observer.KIND].setdefault(body, []).append(estimate)
         if progress is not None:
             progress(count / len(frames))
-    sensors, bodies, words = _compared(prepared, estimates)
+    sensors, bodies, apart = _compared(prepared, estimates)
     found_by = {one.KIND: one for one in observers if further[one.KIND]}
     others = {kind: one.compare(prepared, further[kind]) for kind, one in found_by.items()}
     others = {kind: series for kind, series in others.items() if series}
     summary = None if follower is None else follower.summary
-    return Evaluation(sensors, bodies, summary, others, half.tracker.emitter_strengths, words)
+    return Evaluation(sensors, bodies, summary, others, half.tracker.emitter_strengths, apart)
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ class Evaluation:
     further: dict[str, dict[str, PoseSeries]] = field(default_factory=dict)
     # How emitters differed from the model at the end, in words, where they did
     strengths: str = ''
-    disagreements: tuple[str, ...] = ()  # of bodies' poses with the optical ones as a whole
+    disagreements: tuple[Disagreement, ...] = ()  # of bodies with the optical poses as a whole
 
     @property
     def groups(self) -> dict[str, dict[str, PoseSeries]]:
@@ -231,18 +231,18 @@ def _one_after_another(found: Sequence[Evaluation]) -> Evaluation:
         whole = groups.setdefault(kind, {})
         for name, part in group.items():
             whole[name] = whole[name].followed_by(part) if name in whole else part
-    words = tuple(words for one in found for words in one.disagreements)
+    apart = tuple(each for one in found for each in one.disagreements)
     bare, strengths = (groups.pop('sensors'), groups.pop('bodies')), found[-1].strengths
-    return Evaluation(*bare, found[0].refit, groups, strengths, words)
+    return Evaluation(*bare, found[0].refit, groups, strengths, apart)
 
 
 def _compared(
     prepared: PreparedSession, estimates: Mapping[str, Sequence[PoseEstimate]]
-) -> tuple[dict[str, PoseSeries], dict[str, PoseSeries], tuple[str, ...]]:
+) -> tuple[dict[str, PoseSeries], dict[str, PoseSeries], tuple[Disagreement, ...]]:
     """Compare sensors and bodies with the optical poses, as the model's corrections place them."""
     sensors: dict[str, PoseSeries] = {}
     bodies: dict[str, PoseSeries] = {}
-    words, accuracy = tuple[str, ...](), prepared.session.setup.accuracy
+    apart, accuracy = tuple[Disagreement, ...](), prepared.session.setup.accuracy
     for tool in prepared.session.tools:
         true = with_truth(tool, prepared.correction)
         position = np.where(true.has_pose[:, None], true.position, np.nan)
@@ -254,8 +254,8 @@ def _compared(
             given = estimates[tool.body]
             bodies[tool.body] = pose_series(tool.body, given, position, true.rotation)
             where = f'{prepared.session.path}: {tool.body}'
-            words += disagreement(where, given, (position, true.rotation), accuracy)
-    return sensors, bodies, words
+            apart += disagreement(where, given, (position, true.rotation), accuracy)
+    return sensors, bodies, apart
 
 
 SCHEMA = 'anser_evaluation/1'

@@ -24,7 +24,7 @@ from anser_ros.diagnosis.decisions import UNSTRUCTURED
 from anser_ros.effects.effect import all_effects
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.sessions.calibration import calibrate_sessions
-from anser_ros.sessions.diagnosis import document_of, effect_figures
+from anser_ros.sessions.diagnosis import TrackingErrors, document_of, effect_figures
 from anser_ros.sessions.prepared import correct, prepare
 from anser_ros.sessions.session import Session
 
@@ -165,9 +165,7 @@ def to_document(result: FewPosesDiagnosis) -> dict[str, Any]:
     Poses are not compared: there are too few of them.
     """
     before, after = rms(result.before.held_out.error), rms(result.after.held_out.error)
-    effects = map(effect_figures, result.effects, result.without_t)
+    effects = list(map(effect_figures, result.effects, result.without_t))
     depends_on = list(result.depends_on) if result.unexplained else []
-    return document_of(
-        (before, after, result.floor_t), (None, None), (None, None), list(effects),
-        (result.unexplained, depends_on),
-    )  # fmt: skip
+    flux_t, none = (before, after, result.floor_t), TrackingErrors()
+    return document_of(flux_t, none, none, effects, result.unexplained, depends_on)
