@@ -8,6 +8,7 @@ from diagnosis_world import world
 from effects_scene import candidates, in_force, undrawn
 from tracking_world import three_axis
 
+from anser_ros.diagnosis.engine import is_covered
 from anser_ros.effects.channels import compressed
 from anser_ros.effects.correction import Correction, reference_view, tool_view
 from anser_ros.effects.effect import Family, Remedy, Term, all_effects, effect_named
@@ -60,6 +61,13 @@ def test_a_fluctuation_is_a_rival_of_what_is_steady_on_its_coil(problem):
     assert free[1].effect.covers(free[1], steady['coil_gain'][1])
     assert not free[1].effect.covers(free[1], steady['coil_drift'][1])
     assert not free[1].effect.rivals(free[1], free[1])
+
+
+def test_an_axis_is_looked_for_beside_a_scale_of_all(problem):
+    """One axis that is far off makes most of what a scale and a shift make."""
+    of_all, *axes = all_effects()['optical_scale'].candidates(problem.apparatus)
+    assert len(axes) == 3 and not any(is_covered(axis, [of_all]) for axis in axes)
+    assert is_covered(of_all.with_theta([0.01, 0.0, 0.0, 0.0]), [of_all])
 
 
 def test_an_effect_nobody_wrote_is_refused():

@@ -141,11 +141,6 @@ class OpticalScale(OpticalEffect[Term]):
         """Return the scale's index alone: a shift is a registration's."""
         return np.array([0])
 
-    def covers(self, term: Term, candidate: Term) -> bool:
-        """Cover an axis beside all of them, and the other way round."""
-        mixed = ('axis' in term.site) is not ('axis' in candidate.site)
-        return super().covers(term, candidate) or (candidate.effect is self and mixed)
-
     @staticmethod
     def _stretches(term: Term) -> Array:
         """Return what a unit of scale and of each shear adds to a position, (q, 3, 3)."""
