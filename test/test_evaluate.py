@@ -256,7 +256,7 @@ def test_without_enough_references_there_is_no_pose_near_metal(metal):
         states = [e.state for e in series.estimates]
         assert [e.state for e in none.sensors[name].estimates] == states
         assert 'residual' in states and 'ok' not in states, 'metal is noticed without references'
-    (words,) = figures.why_withheld(model, alone)
+    (words,) = figures.why_withheld(model, alone, metal)
     assert 'state residual in' in words and 'the model knows' in words
 
 

@@ -279,20 +279,24 @@ def usable_frames(measurements: Sequence[Measurements]) -> int:
 
 def is_thick(measurements: Sequence[Measurements]) -> bool:
     """Return whether usable readings spread enough across their plane for a free field."""
-    got, need = _thickness(measurements)
+    got, need, _ = _thickness(measurements)
     return got >= need
 
 
-def _thickness(measurements: Sequence[Measurements]) -> tuple[float, float]:
-    """Return the spread of the usable readings across their plane, and the least one, m rms."""
+def _thickness(measurements: Sequence[Measurements]) -> tuple[float, float, float]:
+    """Return the spread of the usable readings across their plane, the least one, and the largest
+    spread, m rms.
+    """
     points = np.concatenate([m.placed()[0][m.usable] for m in measurements])
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
-    return float(spread[-1]), max(FLATTEST * float(spread[0]), THINNEST_M)
+    return float(spread[-1]), max(FLATTEST * float(spread[0]), THINNEST_M), float(spread[0])
 
 
 def _check_thickness(measurements: Sequence[Measurements]) -> None:
-    got, need = _thickness(measurements)
+    got, need, widest = _thickness(measurements)
     if got < need:
+        if widest < need:
+            raise FitError(f'all readings lie within {1e3 * widest:.2g} mm rms: are places in m?')
         raise FitError(
             f'all readings lie in one plane: their spread across it must be at least '
             f'{1e3 * need:.2f} mm rms, got {1e3 * got:.2f} mm'

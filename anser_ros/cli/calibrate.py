@@ -14,7 +14,7 @@ from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.result import Calibration, to_document
 from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.cli import output
-from anser_ros.cli.diagnosis_words import flux_unit
+from anser_ros.cli.diagnosis_words import flux_unit, short_ones, value_text
 from anser_ros.effects.effect import effect_named
 from anser_ros.errors import FitError
 from anser_ros.field.model import EffectRecord
@@ -23,8 +23,6 @@ from anser_ros.sessions.calibration import calibrate_sessions, check_same_board,
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import save_model
 
-MOST_LISTED = 40
-"""Entries of a list that are shown; of more, their number is."""
 LONG = ('values', 'uncertainty', 'axes')
 """Parameters of a population that are tables, which are shown by themselves."""
 
@@ -133,7 +131,7 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
 
 def _parameters(effect: EffectRecord) -> str:
     found = {k: v for k, v in effect.parameters.items() if k not in LONG}
-    return ', '.join(f'{k} {_short(v)}' for k, v in found.items())
+    return ', '.join(f'{k} {value_text(v)}' for k, v in short_ones(found))
 
 
 def _populations(calibration: Calibration) -> Iterator[Table]:
@@ -142,14 +140,6 @@ def _populations(calibration: Calibration) -> Iterator[Table]:
         head, rows = population_table([record])
         names = [name.removeprefix(f'{record.name} ') for name in head]
         yield output.terminal_table(names, rows, title=record.name)
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, list) and len(value) > MOST_LISTED:
-        return f'{len(value)} of them'
-    if isinstance(value, list):
-        return '[' + ' '.join(_short(v) for v in value) + ']'
-    return f'{value:.5g}' if isinstance(value, float) else str(value)
 
 
 SHOWN_UNITS = {

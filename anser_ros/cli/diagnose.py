@@ -33,12 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         'example: anser diagnose bags/moving.mcap --model config/demo_model.yaml --out result/'
     )
-    words = 'bags to diagnose (.mcap files or bag folders)'
-    parser.add_argument('sessions', nargs='+', metavar='BAG', help=words)
-    output.add_out(parser, sessions.RESULTS)
-    output.add_json(parser, 'diagnosis.json, or the summary, on stdout')
-    output.add_session_options(parser)
-    sessions.add_session_kinds(parser)
+    sessions.add_session_options(parser, 'diagnose', 'diagnosis.json')
 
 
 def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:

@@ -13,11 +13,15 @@ from matplotlib.figure import Figure
 
 from anser_ros.cli import output, sessions
 from anser_ros.cli import page as html
-from anser_ros.errors import ParameterError
+from anser_ros.diagnosis.diagnose import WIRING_FRAMES
+from anser_ros.diagnosis.wiring import wiring_faults
+from anser_ros.errors import DiagnosisError, ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import DEGREES
 from anser_ros.pose_states import OK, RESIDUAL
+from anser_ros.sessions.diagnosis import problem_of
 from anser_ros.sessions.follower import parse_references, with_references
+from anser_ros.sessions.prepared import correct, prepare
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import (
     Evaluation,
@@ -69,7 +73,7 @@ def over_time(evaluation: Evaluation) -> Figure:
     if all(series.ok.all() for series in found.values()):
         lower.text(0.5, 0.5, 'every frame has a pose', transform=lower.transAxes, ha='center')
     upper.grid(alpha=0.3)
-    html.legend_below(figure, upper)
+    html.legend_beside(figure, below=1.0)
     return figure
 
 
@@ -155,7 +159,7 @@ def against_sigma(evaluation: Evaluation, jitter_m: float = 0.0) -> Figure:
     right.set(xlabel='multiple of sigma', ylabel='share of the errors within', ylim=(0, 1.02))
     for panel in (left, right):
         panel.grid(alpha=0.3)
-    html.legend_below(figure, left)
+    html.legend_beside(figure, below=1.0)
     return figure
 
 
@@ -216,11 +220,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'example: anser evaluate bags/metal.mcap --model config/demo_model.yaml'
         ' --refit --baseline bags/scan.mcap --out refit/'
     )
-    words = 'bags to track (.mcap files or bag folders)'
-    parser.add_argument('sessions', nargs='+', metavar='BAG', help=words)
-    output.add_out(parser, sessions.RESULTS)
-    output.add_json(parser, 'evaluation.json, or the summary, on stdout')
-    output.add_session_options(parser, idle='optical_rotation_rad')
+    sessions.add_session_options(parser, 'track', 'evaluation.json', 'optical_rotation_rad')
     words = 'let the model follow the reference sensors'
     parser.add_argument('--refit', action='store_true', help=words)
     words = 'reference sensors that the refit may use; the others are ignored'
@@ -237,7 +237,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='largest residual of a pose, in units of the expected one; inf withholds none (only '
         'to see the error that a wrong model would cause)',
     )  # fmt: skip
-    sessions.add_session_kinds(parser)
 
 
 def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
@@ -259,7 +258,7 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         progress=lambda share: tell('tracking', share),
     )  # fmt: skip
     document = {**to_document(evaluation), 'recording': recording_of(session)}
-    if why := why_withheld(model, evaluation):
+    if why := why_withheld(model, evaluation, session):
         document['withheld'] = why[0]
     written = list(output.write_files(args.out, {'evaluation.json': document}))
     written += write_tables(args.out, evaluation)
@@ -292,7 +291,16 @@ def _few_notes(session: Session) -> tuple[str, ...]:
     )
 
 
-def why_withheld(model: FieldModel, evaluation: Evaluation) -> tuple[str, ...]:
+def _wired(session: Session, model: FieldModel) -> str:
+    """What is wired otherwise than a model says, as `diagnose` names it; empty without poses."""
+    try:
+        problem = problem_of(correct(prepare(session, model))).thinned(WIRING_FRAMES)
+    except DiagnosisError:
+        return ''
+    return ', '.join(term.label for term in wiring_faults(problem))
+
+
+def why_withheld(model: FieldModel, evaluation: Evaluation, session: Session) -> tuple[str, ...]:
     """State why hardly a body, or else a coil, has a pose, or most misfit a known model."""
     parameters = [effect.parameters for effect in model.effects]
     each = (p.get('channels', [p['channel']] if 'channel' in p else ()) for p in parameters)
@@ -310,10 +318,12 @@ def why_withheld(model: FieldModel, evaluation: Evaluation) -> tuple[str, ...]:
     such = f' ({reasons[len(reasons) // 2]})' if reasons else ''
     listed = f'the coils of its calibration (channels {", ".join(map(str, known))})'
     why = (
-        f': the model knows {listed if known else "no coil by itself"}; another one is off in '
-        'gain and axis, by 2 % and 1 deg as wound by hand: calibrate with what is tracked; '
+        f': the model knows {listed if known else "no coil by itself"}; one not among '
+        'them, 2 % and 1 deg off as wound by hand, needs a calibration of its own; '
         'anser diagnose names what else differs, as metal does'
     )
+    if worst == RESIDUAL and (wired := _wired(session, model)):
+        why = f': the readings are those of {wired}; anser diagnose writes a model with that'
     return (
         f'{whose} withheld, state {worst} in {count} of {len(poses)}{such}'
         f'{why if worst == RESIDUAL else ""}',

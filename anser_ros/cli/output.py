@@ -75,19 +75,6 @@ def add_model(parser: argparse.ArgumentParser, **options: Any) -> None:
     parser.add_argument('--model', help=words, **options)
 
 
-def add_session_options(parser: argparse.ArgumentParser, idle: str = '') -> None:
-    """Declare what a session is taken with; ``idle`` is a value without effect, not to state."""
-    add_model(parser)
-    parser.add_argument('--baseline', help='distortion-free recording of the same board')
-    add_list(
-        parser, '--resurveyed', metavar='BODY',
-        help='the sensors on BODY are those of the model, and were surveyed again: their '
-        'channels are corrected as the model says, and their places and axes are those of '
-        'the session; may be repeated',
-    )  # fmt: skip
-    add_stated_values(parser, 'accuracy', 'refit', 'tools', idle=idle)
-
-
 _made: list[Path] = []
 """Folders that this command has made, parents first."""
 

@@ -34,25 +34,20 @@ def save(figure: Figure, path: Path | io.BytesIO) -> None:
     plt.close(figure)
 
 
-def legend_below(figure: Figure, panel: Axes, markers: float = 1.0) -> None:
-    """Put one legend below all panels, where it covers nothing, with what one of them labels.
+def legend_beside(figure: Figure, below: float = 0.0) -> None:
+    """Put one legend beside all panels, with an entry for each label of any of them.
 
-    Its markers are larger than the panel's by a factor, as dots are too small to tell apart.
+    Where ``below`` is given it is below them, its markers larger than the panels' by that factor.
     """
-    handles, labels = panel.get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc='outside lower center', ncols=min(len(labels), 5), fontsize=8,
-        markerscale=markers,
-    )  # fmt: skip
-
-
-def legend_beside(figure: Figure) -> None:
-    """Put one legend beside all panels, with an entry for each label of any of them."""
     unique: dict[str, Artist] = {}
     for panel in figure.axes:
         handles, labels = panel.get_legend_handles_labels()
         unique |= dict(zip(labels, handles, strict=True))
-    figure.legend(list(unique.values()), list(unique), loc='outside right upper', fontsize=8)
+    where, columns = ('lower center', min(len(unique), 5)) if below else ('right upper', 1)
+    figure.legend(
+        list(unique.values()), list(unique), loc=f'outside {where}', ncols=columns, fontsize=8,
+        markerscale=below or None,
+    )  # fmt: skip
 
 
 def spell_out(axis: Axis) -> None:

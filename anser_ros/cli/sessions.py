@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from rich.table import Table
 
+from anser_ros.cli import output
 from anser_ros.cli.commands import SESSION_KINDS
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, EXIT_OK, attempt
 from anser_ros.cli.output import Result, Tell, loss_notes, make_folder, number, stated_values
@@ -23,8 +24,25 @@ from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import SNAPSHOT, is_snapshot, model_for
 
 
-def add_session_kinds(parser: argparse.ArgumentParser) -> None:
-    """Declare an option for each kind of session, and the options that it has."""
+def add_session_options(
+    parser: argparse.ArgumentParser, verb: str, file: str, idle: str = ''
+) -> None:
+    """Declare sessions, what they are taken with and where their results go, and an option for
+    each kind of session with its own; ``idle`` is a value without effect, not to state.
+    """
+    words = f'bags to {verb} (.mcap files or bag folders)'
+    parser.add_argument('sessions', nargs='+', metavar='BAG', help=words)
+    output.add_out(parser, RESULTS)
+    output.add_json(parser, f'{file}, or the summary, on stdout')
+    output.add_model(parser)
+    parser.add_argument('--baseline', help='distortion-free recording of the same board')
+    output.add_list(
+        parser, '--resurveyed', metavar='BODY',
+        help='the sensors on BODY are those of the model, and were surveyed again: their '
+        'channels are corrected as the model says, and their places and axes are those of '
+        'the session; may be repeated',
+    )  # fmt: skip
+    output.add_stated_values(parser, 'accuracy', 'refit', 'tools', idle=idle)
     for name, (module, line) in SESSION_KINDS.items():
         parser.add_argument(f'--{name}', action='store_true', help=line)
         importlib.import_module(module).add_options(parser)

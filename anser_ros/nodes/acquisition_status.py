@@ -162,7 +162,7 @@ def clock_troubles(stream: FluxStream) -> list[tuple[Level, str]]:
         words = f'clock: everything arrives {clock.lateness_s:.2g} s late'
         found.append((Level.WARN, words))
     elif clock.state is ClockState.SETTLING and stream.withheld:
-        found.append((Level.ERROR, 'clock: settling, no stamp is good yet'))
+        found.append((Level.WARN, 'clock: settling, no stamp is good yet'))
     if stream.ticks.words:
         words = f"clock: the device's ticks {stream.ticks.words}; stamps follow its samples"
         found.append((Level.WARN, words))

@@ -38,7 +38,7 @@ from anser_ros.field.nominal import nominal_model
 from anser_ros.sessions.baseline import readings_of
 from anser_ros.sessions.drawn_calibration import fit_to_drawing, is_for_drawing
 from anser_ros.sessions.nominal_board import NominalBoard, board_of
-from anser_ros.sessions.plausibility import silent
+from anser_ros.sessions.plausibility import FLUX_UNITS, TOO_LARGE, silent, unit_words
 from anser_ros.sessions.session import Session, shifted
 from anser_ros.sessions.starting_model import made_for
 from anser_ros.settings import Accuracy
@@ -416,9 +416,9 @@ def calibrate_sessions(
     sessions = [part for session in sessions for part in session.mountings()]
     setup = sessions[0].setup
     for session in sessions:
-        if dead := ', '.join(silent(session.setup, session.tools)):
-            words = 'mend it, or leave it out of the setup'
-            raise FitError(f'{session.path}: {dead} gives nothing but noise: is it dead? {words}')
+        for name, often in silent(session.setup, session.tools).items():
+            dead = f'{name} gives nothing but noise{often}: is it dead?'
+            raise FitError(f'{session.path}: {dead} mend it, or leave it out, or that time')
     surveyed_m = setup.stated.get('tool_coil_position_m', options.surveyed_m)
     options = replace(options, accuracy=setup.accuracy, surveyed_m=surveyed_m)
     chosen = next(engine for engine in all_engines() if engine.accepts(sessions, options))
@@ -438,4 +438,18 @@ def calibrate_sessions(
         model = made_for(model, session.setup)
     steady, _ = at_constant_strength(sessions, options)
     kept = next((r for r in map(readings_of, steady) if r is not None), None)
-    return replace(calibration, model=replace(model, references=kept))
+    words = (*calibration.contradictions, *_noise_words(calibration, setup))
+    return replace(calibration, model=replace(model, references=kept), contradictions=words)
+
+
+def _noise_words(calibration: Calibration, setup: Setup) -> list[str]:
+    """Words where the noise, all that says in T how large fluxes are, is not what is stated."""
+    stated, least = setup.stated.get('flux_noise_t', 0.0), calibration.held_out.flux_noise_t
+    found = max(least, min(calibration.fit.noise_t, stated))  # errors of poses are in the latter
+    ratio = found / stated if stated else 1.0
+    if 1.0 / TOO_LARGE < ratio < TOO_LARGE:
+        return []
+    return [
+        f'fluxes: noise of {found:.2g} T is found, {ratio:.3g} times the stated flux_noise_t: '
+        f'{unit_words(ratio, FLUX_UNITS) or "another unit than T"}, or is that stated wrongly?'
+    ]

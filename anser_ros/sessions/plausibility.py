@@ -59,10 +59,11 @@ reading is right. Half a turn about an axis leaves a third of a triaxial coil's 
 TOO_LARGE = 100.0
 """Factor over the nominal board's fluxes, or below them, from which a unit is in doubt; gains stay
 far inside."""
-SILENT, WEAK = 2.0, 0.01
-"""Root mean square of an emitter's fluxes, over the stated noise of a component (noise alone has
-1.4) and over the strongest emitter's, below both of which it is dead: readings in another unit are
-below the first alone, a small coil far away below the second."""
+SILENT, WEAK, OFTEN = 4.0, 0.01, 0.1
+"""Root mean square of an emitter's fluxes in a frame, over the stated noise of a component (of one
+reading in 3000 noise alone has more) and over the strongest emitter's, below both of which it is
+dead, and share of the frames from which on it is said: readings in another unit are below the
+first alone, a small coil far away below the second, one that turns only for a moment."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,7 @@ OTHER_READINGS = (
     Reading('rotations from fg to the body', is_inverse=True),
     Reading('quaternions with w first and rotations from fg to the body', W_FIRST, True),
     *(Reading(f'positions in {unit}', scale=1 / size) for unit, size in LENGTH_UNITS.items()),
+    Reading('positions in kilometres', scale=1e3),  # divided once too often
     *(
         Reading(f'positions in {unit} and quaternions with w first', W_FIRST, scale=1 / size)
         for unit, size in LENGTH_UNITS.items()
@@ -270,8 +272,11 @@ def plausible_tools(
     """
     nominal, kept, words = NominalBoard.of(setup), [], []
     if tools and not any(np.nan_to_num(tool.flux).any() for tool in tools):
-        raise PlausibilityError(f'{path}: all fluxes of all tools are zero: an empty band?')
-    words += [f'{name} gives nothing but noise: is it dead?' for name in silent(setup, tools)]
+        is_read = any(np.isfinite(tool.flux).any() for tool in tools)
+        what = 'zero: an empty band?' if is_read else 'missing or not finite'
+        raise PlausibilityError(f'{path}: all fluxes of all tools are {what}')
+    dead = silent(setup, tools).items()
+    words += [f'{name} gives nothing but noise{often}: is it dead?' for name, often in dead]
     for tool in tools:
         words += [*_check_refused(path, tool, refused), *_missing(tool)]
         _check_clocks(path, tool)
@@ -287,13 +292,23 @@ def plausible_tools(
     return tuple(kept), '; '.join(words)
 
 
-def silent(setup: Setup, tools: Sequence[Measurements]) -> list[str]:
-    """Return the names of emitters of which some tools read no more than noise; of all, none."""
-    power = np.array([np.nansum(np.abs(t.flux) ** 2, axis=(0, 1)) for t in tools]).sum(axis=0)
-    count = np.array([np.isfinite(t.flux).sum(axis=(0, 1)) for t in tools]).sum(axis=0)
-    size = np.sqrt(power / np.maximum(count, 1)) if tools else np.zeros(0)
-    least = min(SILENT * setup.accuracy.flux_noise_t, WEAK * size.max(initial=0.0))
-    return [setup.emitter_names[k] for k in np.flatnonzero(size < least)]
+def silent(setup: Setup, tools: Sequence[Measurements]) -> dict[str, str]:
+    """Return the emitters of which tools read no more than noise while others give more, with
+    words on how often; empty for always. A missing reading is none, if there are others.
+    """
+    power = [np.where(np.isfinite(tool.flux), np.abs(tool.flux) ** 2, np.nan) for tool in tools]
+    with np.errstate(invalid='ignore'):  # what nobody reads in a frame has no size
+        means = [np.nansum(one, axis=1) / np.isfinite(one).sum(axis=1) for one in power]
+    size = np.sqrt(np.concatenate([np.zeros((0, len(setup.emitter_names))), *means]))
+    size[:, np.isnan(size).all(axis=0)] = 0.0
+    strongest = np.nanmax(size, axis=1, keepdims=True, initial=0.0)
+    dead = size < np.minimum(SILENT * setup.accuracy.flux_noise_t, WEAK * strongest)
+    counts = zip(dead.sum(axis=0).tolist(), np.isfinite(size).sum(axis=0).tolist(), strict=True)
+    return {
+        name: f' in {lost} of {count} frames' if lost < count else ''
+        for name, (lost, count) in zip(setup.emitter_names, counts, strict=True)
+        if lost > OFTEN * count
+    }
 
 
 def _missing(tool: Measurements) -> list[str]:

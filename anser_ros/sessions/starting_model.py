@@ -189,7 +189,7 @@ def check_fits(model: FieldModel, session: Session) -> None:
     check_emitters(session.setup, model, f'the session {session.path}')
     size, dead = np.abs(model.moments).max(axis=0), silent(session.setup, session.tools)
     for name in np.array(model.emitters)[size < NO_FIELD * size.max()].tolist():
-        if session.tools and name not in dead:
+        if session.tools and dead.get(name) != '':
             words = 'was it dead in the calibration?'
             raise ModelFileError(f'the model has no field of {name}, {session.path} has: {words}')
 

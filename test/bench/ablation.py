@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, ScalarFormatter
 
-from anser_ros.cli.page import legend_below, save, spell_out
+from anser_ros.cli.page import legend_beside, save, spell_out
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import FieldFunction, default_clouds, excitation_for
@@ -193,5 +193,5 @@ def plot(rows: Sequence[AblationRow], path: Path, titles: dict[str, str]) -> Non
         spell_out(axes.yaxis)
         axes.set(title=titles[session], xlabel='reference coils', ylabel='position RMSE, mm')
         axes.grid(True, which='both', alpha=0.3)
-    legend_below(figure, figure.axes[0])
+    legend_beside(figure, below=1.0)
     save(figure, path)

@@ -1,6 +1,7 @@
 """Reports what a node says of itself: statuses, and warnings that do not flood."""
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -100,6 +101,10 @@ class Trouble:
         self.last, self._at_s = '', -math.inf
 
 
+MOST_KINDS = 200
+"""Kinds of warnings that are told apart: a sender of ever other names must fill no memory."""
+
+
 class Throttle:
     """Lets the first warning of a kind through whole, and the rest at most once a period."""
 
@@ -111,8 +116,11 @@ class Throttle:
     def admit(self, kind: str, text: str, now_s: float) -> str | None:
         """Return the text to log now, or None when this one is held back.
 
-        Warnings of one kind are throttled together; times are monotonic.
+        Warnings of one kind that differ in numbers alone are throttled together; times are
+        monotonic.
         """
+        kind += re.sub(r'\d+', '', text)
+        kind = kind if kind in self._last_s or len(self._last_s) < MOST_KINDS else ''
         last_s = self._last_s.get(kind)
         if last_s is not None and now_s - last_s < self._period_s:
             self._held_back[kind] += 1

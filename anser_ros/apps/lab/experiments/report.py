@@ -11,7 +11,7 @@ from anser_ros.apps.lab.experiments import recordings
 from anser_ros.apps.lab.experiments.recordings import HEAD_DISTANCES_CM, MATERIALS, checkerboard
 from anser_ros.apps.lab.experiments.study import SensorErrors, Study
 from anser_ros.arrays import Array, ComplexArray, Integers
-from anser_ros.cli.page import legend_below, save
+from anser_ros.cli.page import legend_beside, save
 from anser_ros.field.model import FieldModel
 from anser_ros.sessions.session import Session
 
@@ -104,7 +104,7 @@ def _cdfs(
         panel.set(xlabel='position error, mm', title=words)
         panel.grid(alpha=0.3)
     panels[0].set_ylabel('share of the points')
-    legend_below(figure, panels[0])
+    legend_beside(figure, below=1.0)
     return _save(figure, path, title)
 
 
@@ -115,7 +115,7 @@ def _training_points(study: Study, folder: Path) -> Path:
         where = 1e3 * session.tools[0].position
         panel.plot(where[:, 0], where[:, 1], mark, ms=4, label=f'{name} ({len(where)})')
     panel.set(xlabel='x, mm', ylabel='y, mm', aspect='equal')
-    legend_below(figure, panel)
+    legend_beside(figure, below=1.0)
     return _save(figure, folder / 'fig_2.png', 'Training and test points over a plate')
 
 

@@ -40,16 +40,7 @@ from anser_ros.apps.poses.cli.pose_source import add_source_options, source_of
 from anser_ros.apps.poses.corrector import as_document
 from anser_ros.apps.poses.sequence import missing_words
 from anser_ros.cli import output
-from anser_ros.cli.page import (
-    heading,
-    legend_below,
-    legend_beside,
-    page,
-    paragraph,
-    picture,
-    table,
-    top,
-)
+from anser_ros.cli.page import heading, legend_beside, page, paragraph, picture, table, top
 from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
 from anser_ros.wire.tables import read_table
@@ -485,7 +476,7 @@ def _speeds(found: Assessment) -> Figure:
         panel.set_xlabel('speed, mm/s')
         panel.grid(alpha=0.3)
     left.set_ylabel('error, rms mm')
-    legend_below(figure, left)
+    legend_beside(figure, below=1.0)
     right.set_ylabel('latency against the reference, ms')
     return figure
 

@@ -31,7 +31,7 @@ from anser_ros.cli.page import (
     Html,
     details,
     heading,
-    legend_below,
+    legend_beside,
     page,
     paragraph,
     picture,
@@ -382,7 +382,7 @@ def over_time(states: Mapping[str, tuple[PoseState, str]]) -> Figure:
                       label=label if k == 0 else None)  # fmt: skip
     axes.set(xlabel='time, s', ylabel='distance, mm', yscale='log')
     spell_out(axes.yaxis)
-    legend_below(figure, axes, markers=4.0)
+    legend_beside(figure, below=4.0)
     return figure
 
 
