@@ -225,6 +225,15 @@ def test_a_reversed_sensor_of_a_scan_is_used_and_what_no_field_explains_refused(
     wrong, mixed = (replace(factory, tools=(replace(tool, flux=flux),)) for flux in given)
     right, found, none = (calibrate_sessions([s], options) for s in (factory, wrong, mixed))
     assert [e.name for e in right.model.effects] == []
+    noise_t = right.held_out.flux_noise_t
+    for stated_t, said in ((noise_t, ''), (1e-3 * noise_t, 'millitesla'), (1e3 * noise_t, 'unit')):
+        stated = factory.with_stated({'flux_noise_t': stated_t})
+        words = ' '.join(calibrate_sessions([stated], options).contradictions)
+        assert said in words and ('times the stated flux_noise_t' in words) is bool(said)
+    middle = replace(tool.sensors, position=np.zeros((len(tool.sensors), 3)))
+    bare = replace(tool, sensors=middle, position=1e-4 * tool.position, track=None)
+    with pytest.raises(FitError, match=r'within 0\.\d+ mm rms: are places in m\?'):
+        calibrate_sessions([replace(factory, tools=(bare,))], options)
     (record,) = found.model.effects
     channels = tool.sensors.channel[1:2].tolist()
     assert (record.name, record.parameters) == ('sensor_polarity', {'channels': channels})

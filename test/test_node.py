@@ -22,7 +22,7 @@ from anser_ros.apps.dashboard.nodes.view_source import Polled, polling_node
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.nodes.runtime import parameters, qos
 from anser_ros.nodes.runtime import process as processes
-from anser_ros.nodes.runtime.diagnostics import Throttle
+from anser_ros.nodes.runtime.diagnostics import MOST_KINDS, Throttle
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 from anser_ros.nodes.runtime.parameters import complaints, parameter
 from anser_ros.parallel import ONE_THREAD
@@ -127,6 +127,15 @@ class TestThrottle:
         assert throttle.admit('crc', 'bad crc', 101.0) == 'bad crc'
         assert throttle.admit('gap', 'gap of 5', 110.0) == 'gap of 5 (1 more like it held back)'
         assert throttle.admit('gap', 'gap of 6', 121.0) == 'gap of 6'
+
+    def test_unlike_reasons_of_a_kind_are_not_held_back_for_each_other(self):
+        throttle = Throttle(10.0)
+        for text in ("the cloud lacks the field 'x'", 'point_step 0 and width 9 make no cloud'):
+            assert throttle.admit('refused', text, 100.0) == text
+        assert throttle.admit('refused', 'point_step 4 and width 7 make no cloud', 101.0) is None
+        texts = [f'frame {chr(200 + i)}' for i in range(2 * MOST_KINDS)]
+        said = [text for text in texts if throttle.admit('refused', text, 102.0)]
+        assert len(said) == MOST_KINDS - 1, 'ever other names are one kind in the end'
 
 
 NODE = '''

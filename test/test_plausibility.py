@@ -76,15 +76,22 @@ def test_what_is_right_passes_unchanged(moving, tool):
         f'fluxes of {tool.body} are missing or not finite in 1 of {len(flux)} frames'
     )
     assert words in checked(moving, replace(tool, flux=flux))[1]
+    half = tool.flux.copy()
+    half[len(half) // 2 :, :, 1] = 0.0
+    half[:9] = np.nan  # missing readings are no silence
+    dead = f'in {len(half) - len(half) // 2} of {len(half) - 9} frames: is it dead?'
+    assert f'coil1 gives nothing but noise {dead}' in checked(moving, replace(tool, flux=half))[1]
+    half[len(half) // 2 :, :, 1] = np.nan
+    assert 'noise' not in checked(moving, replace(tool, flux=half))[1]
     with pytest.raises(ModelFileError, match=r'no field of coil1, .* dead in the calibration'):
         known = load_model(MODEL)
         moments = np.where(np.arange(8) == 1, 0.0, known.moments)
         diagnose_session(moving, replace(known, moments=moments))
 
 
-@pytest.mark.parametrize('unit', LENGTH_UNITS)
+@pytest.mark.parametrize('unit', [*LENGTH_UNITS, 'kilometres'])
 def test_positions_in_another_unit(moving, tool, unit):
-    wrong = with_track(tool, position=LENGTH_UNITS[unit] * tool.track.position)
+    wrong = with_track(tool, position=LENGTH_UNITS.get(unit, 1e-3) * tool.track.position)
     says(moving, wrong, f'positions in {unit}', 'span')
     also = with_track(wrong, quaternion=tool.track.quaternion[:, [3, 0, 1, 2]])
     says(moving, also, f'positions in {unit} and quaternions with w first')
@@ -141,6 +148,7 @@ def test_fluxes_in_another_unit(moving, tool, unit):
     assert 'times what the drawn board makes at its poses: another unit than T?' in words
     blind = replace(larger, track=None, has_pose=np.zeros_like(tool.has_pose))
     says(moving, replace(tool, flux=0.0 * tool.flux), 'all fluxes of all tools are zero')
+    says(moving, replace(tool, flux=np.nan * tool.flux), 'of all tools are missing or not finite')
     if unit == 'millitesla':  # without poses, so much could still be near a coil
         assert checked(moving, blind)[1] == ''
     else:

@@ -284,9 +284,7 @@ def is_thick(measurements: Sequence[Measurements]) -> bool:
 
 
 def _thickness(measurements: Sequence[Measurements]) -> tuple[float, float, float]:
-    """Return the spread of the usable readings across their plane, the least one, and the largest
-    spread, m rms.
-    """
+    """Return spreads of usable readings, m rms: across their plane, the least, the largest."""
     points = np.concatenate([m.placed()[0][m.usable] for m in measurements])
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
     return float(spread[-1]), max(FLATTEST * float(spread[0]), THINNEST_M), float(spread[0])

@@ -302,9 +302,7 @@ def _wired(session: Session, model: FieldModel) -> str:
 
 def why_withheld(model: FieldModel, evaluation: Evaluation, session: Session) -> tuple[str, ...]:
     """State why hardly a body, or else a coil, has a pose, or most misfit a known model."""
-    parameters = [effect.parameters for effect in model.effects]
-    each = (p.get('channels', [p['channel']] if 'channel' in p else ()) for p in parameters)
-    known = sorted({channel for channels in each for channel in channels})
+    known = sorted({channel for effect in model.effects for channel in effect.channels})
     of_bodies = any(2 * body.ok.mean() > 1 for body in evaluation.bodies.values())
     asked = evaluation.sensors if of_bodies else evaluation.bodies or evaluation.sensors
     poses = [pose for series in asked.values() for pose in series.estimates]
@@ -316,17 +314,16 @@ def why_withheld(model: FieldModel, evaluation: Evaluation, session: Session) ->
     whose = 'most poses of single coils are' if of_bodies else 'most poses are'
     reasons = [pose.reason for pose in poses if pose.state == worst and pose.reason]
     such = f' ({reasons[len(reasons) // 2]})' if reasons else ''
+    words = f'{whose} withheld, state {worst} in {count} of {len(poses)}{such}'
+    if worst != RESIDUAL:
+        return (words,)
+    if wired := _wired(session, model):
+        return (f'{words}: they read like {wired}; anser diagnose writes a model with that',)
     listed = f'the coils of its calibration (channels {", ".join(map(str, known))})'
-    why = (
-        f': the model knows {listed if known else "no coil by itself"}; one not among '
-        'them, 2 % and 1 deg off as wound by hand, needs a calibration of its own; '
-        'anser diagnose names what else differs, as metal does'
-    )
-    if worst == RESIDUAL and (wired := _wired(session, model)):
-        why = f': the readings are those of {wired}; anser diagnose writes a model with that'
     return (
-        f'{whose} withheld, state {worst} in {count} of {len(poses)}{such}'
-        f'{why if worst == RESIDUAL else ""}',
+        f'{words}: the model knows {listed if known else "no coil by itself"}; another one, 2 % '
+        'and 1 deg off as wound by hand, needs a calibration with it; anser diagnose names what '
+        'else differs, as metal does',
     )
 
 

@@ -70,11 +70,6 @@ def stated_values(
     return stated
 
 
-def add_model(parser: argparse.ArgumentParser, **options: Any) -> None:
-    words = "model file, or 'nominal' for the setup's own geometry"
-    parser.add_argument('--model', help=words, **options)
-
-
 _made: list[Path] = []
 """Folders that this command has made, parents first."""
 

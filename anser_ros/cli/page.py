@@ -43,10 +43,10 @@ def legend_beside(figure: Figure, below: float = 0.0) -> None:
     for panel in figure.axes:
         handles, labels = panel.get_legend_handles_labels()
         unique |= dict(zip(labels, handles, strict=True))
-    where, columns = ('lower center', min(len(unique), 5)) if below else ('right upper', 1)
     figure.legend(
-        list(unique.values()), list(unique), loc=f'outside {where}', ncols=columns, fontsize=8,
-        markerscale=below or None,
+        list(unique.values()), list(unique), fontsize=8, markerscale=below or None,
+        loc='outside lower center' if below else 'outside right upper',
+        ncols=min(len(unique), 5) if below else 1,
     )  # fmt: skip
 
 

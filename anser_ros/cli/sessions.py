@@ -34,7 +34,7 @@ def add_session_options(
     parser.add_argument('sessions', nargs='+', metavar='BAG', help=words)
     output.add_out(parser, RESULTS)
     output.add_json(parser, f'{file}, or the summary, on stdout')
-    output.add_model(parser)
+    parser.add_argument('--model', help="model file, or 'nominal' for the setup's own geometry")
     parser.add_argument('--baseline', help='distortion-free recording of the same board')
     output.add_list(
         parser, '--resurveyed', metavar='BODY',

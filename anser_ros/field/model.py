@@ -273,6 +273,12 @@ class EffectRecord:
     uncertainty: Mapping[str, Any] = field(default_factory=dict)
     evidence: Mapping[str, Any] = field(default_factory=dict)  # figures that support the effect
 
+    @property
+    def channels(self) -> list[Any]:
+        """Return the channels of the sensors that the effect names."""
+        given = (self.parameters.get(key, ()) for key in ('channel', 'channels'))
+        return [channel for one in given for channel in np.ravel(one).tolist()]
+
     def needed(self, key: str) -> Any:
         """Return a parameter; raises `ModelFileError` when it is missing."""
         try:

@@ -438,8 +438,8 @@ def calibrate_sessions(
         model = made_for(model, session.setup)
     steady, _ = at_constant_strength(sessions, options)
     kept = next((r for r in map(readings_of, steady) if r is not None), None)
-    words = (*calibration.contradictions, *_noise_words(calibration, setup))
-    return replace(calibration, model=replace(model, references=kept), contradictions=words)
+    doubts = (*calibration.contradictions, *_noise_words(calibration, setup))
+    return replace(calibration, model=replace(model, references=kept), contradictions=doubts)
 
 
 def _noise_words(calibration: Calibration, setup: Setup) -> list[str]:
@@ -447,9 +447,8 @@ def _noise_words(calibration: Calibration, setup: Setup) -> list[str]:
     stated, least = setup.stated.get('flux_noise_t', 0.0), calibration.held_out.flux_noise_t
     found = max(least, min(calibration.fit.noise_t, stated))  # errors of poses are in the latter
     ratio = found / stated if stated else 1.0
-    if 1.0 / TOO_LARGE < ratio < TOO_LARGE:
-        return []
-    return [
+    words = (
         f'fluxes: noise of {found:.2g} T is found, {ratio:.3g} times the stated flux_noise_t: '
         f'{unit_words(ratio, FLUX_UNITS) or "another unit than T"}, or is that stated wrongly?'
-    ]
+    )
+    return [] if 1.0 / TOO_LARGE < ratio < TOO_LARGE else [words]

@@ -118,11 +118,10 @@ OTHER_READINGS = (
     Reading('quaternions with w first', W_FIRST),
     Reading('rotations from fg to the body', is_inverse=True),
     Reading('quaternions with w first and rotations from fg to the body', W_FIRST, True),
-    *(Reading(f'positions in {unit}', scale=1 / size) for unit, size in LENGTH_UNITS.items()),
-    Reading('positions in kilometres', scale=1e3),  # divided once too often
     *(
-        Reading(f'positions in {unit} and quaternions with w first', W_FIRST, scale=1 / size)
-        for unit, size in LENGTH_UNITS.items()
+        Reading(f'positions in {unit}{also}', order, scale=1 / size)
+        for also, order in (('', AS_WRITTEN.order), (' and quaternions with w first', W_FIRST))
+        for unit, size in {**LENGTH_UNITS, 'kilometres': 1e-3}.items()  # divided once too often
     ),
     *_other_axes(),
 )
@@ -303,10 +302,10 @@ def silent(setup: Setup, tools: Sequence[Measurements]) -> dict[str, str]:
     size[:, np.isnan(size).all(axis=0)] = 0.0
     strongest = np.nanmax(size, axis=1, keepdims=True, initial=0.0)
     dead = size < np.minimum(SILENT * setup.accuracy.flux_noise_t, WEAK * strongest)
-    counts = zip(dead.sum(axis=0).tolist(), np.isfinite(size).sum(axis=0).tolist(), strict=True)
+    rows = zip(setup.emitter_names, dead.sum(axis=0), np.isfinite(size).sum(axis=0), strict=True)
     return {
         name: f' in {lost} of {count} frames' if lost < count else ''
-        for name, (lost, count) in zip(setup.emitter_names, counts, strict=True)
+        for name, lost, count in rows
         if lost > OFTEN * count
     }
 

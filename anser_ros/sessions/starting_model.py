@@ -166,13 +166,8 @@ def _bodies_of(model: FieldModel, setup: Setup) -> set[str]:
     """Bodies of the setup whose sensors an effect of the model names."""
     found = set()
     for effect in model.effects:
-        parameters = effect.parameters
-        several = parameters.get('channels')
-        channels = [
-            parameters.get('channel'), *(several if isinstance(several, list | tuple) else ())
-        ]  # fmt: skip
-        found |= {s.body for s in setup.sensors if s.channel in channels}
-        found |= {s.body for s in setup.sensors if s.body == parameters.get('body')}
+        named, body = effect.channels, effect.parameters.get('body')
+        found |= {s.body for s in setup.sensors if s.channel in named or s.body == body}
     return found
 
 

@@ -116,8 +116,7 @@ class Throttle:
     def admit(self, kind: str, text: str, now_s: float) -> str | None:
         """Return the text to log now, or None when this one is held back.
 
-        Warnings of one kind that differ in numbers alone are throttled together; times are
-        monotonic.
+        Warnings of a kind that differ in numbers alone are one to it; times are monotonic.
         """
         kind += re.sub(r'\d+', '', text)
         kind = kind if kind in self._last_s or len(self._last_s) < MOST_KINDS else ''

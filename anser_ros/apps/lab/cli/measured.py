@@ -128,11 +128,8 @@ def table(rows: list[ReportRow]) -> Table:
         out.add_column(heading, justify='right' if heading in figures else 'left', overflow='fold')
     for row in rows:
         met = {None: '', True: 'yes', False: 'no'}[row.met]
-        values = (row.before, row.after, row.special, row.target)
-        shown = [_number(value, row.unit) for value in values]
+        given = (row.before, row.after, row.special, row.target)
+        values = (math.nan if value is None else value for value in given)
+        shown = ['' if math.isnan(v) else f'{v:.3g} {row.unit}'.strip() for v in values]
         out.add_row(row.dataset, row.figure, *shown, met, row.chosen_on)
     return out
-
-
-def _number(value: float | None, unit: str) -> str:
-    return '' if value is None or math.isnan(value) else f'{value:.3g} {unit}'.strip()

@@ -211,9 +211,4 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[recipe.ReportRow]:
     ]  # fmt: skip
 
 
-def commands(bags: list[Path], out: Path) -> list[list[str]]:
-    """Return the commands that calibrate the recording."""
-    return recipe.calibrations(bags[0], out)
-
-
-RECIPE = recipe.Recipe(NAME, write_sessions, commands, rows)
+RECIPE = recipe.Recipe(NAME, write_sessions, recipe.calibrations, rows)

@@ -174,12 +174,10 @@ def write_session(recording: Recording, path: Path, setup: Setup | None = None) 
 
 def write_sessions(folder: Path, into: Path) -> list[Path]:
     """Write every file of poses as a session; return the files written."""
-    out = []
-    for name in file_names(folder):
-        path = into / f'magnet_{name}.mcap'
+    paths = {name: into / f'magnet_{name}.mcap' for name in file_names(folder)}
+    for name, path in paths.items():
         write_session(load(folder, name), path)
-        out.append(path)
-    return out
+    return list(paths.values())
 
 
 def commands(bags: list[Path], out: Path) -> list[list[str]]:
@@ -252,11 +250,6 @@ def write_step(folder: Path, into: Path) -> list[Path]:
     return [path]
 
 
-def step_commands(bags: list[Path], out: Path) -> list[list[str]]:
-    """Return the commands that model the robot's file, with sensors as stated and as found."""
-    return recipe.calibrations(bags[0], out)
-
-
 def step_rows(folder: Path, bags: list[Path], out: Path) -> list[recipe.ReportRow]:
     """Return the errors of the field at blocks of poses that took no part."""
     before, after = (
@@ -272,4 +265,4 @@ def step_rows(folder: Path, bags: list[Path], out: Path) -> list[recipe.ReportRo
     ]  # fmt: skip
 
 
-STEP_RECIPE = recipe.Recipe(STEP, write_step, step_commands, step_rows, folder=NAME)
+STEP_RECIPE = recipe.Recipe(STEP, write_step, recipe.calibrations, step_rows, folder=NAME)

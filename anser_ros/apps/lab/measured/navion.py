@@ -110,7 +110,7 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
 
 def commands(bags: list[Path], out: Path) -> list[list[str]]:
     """Return the commands that predict each height, with sensors as stated and as found."""
-    return calibrations(bags[0], out, ('--estimate', 'gains,axes,bend'))
+    return calibrations(bags, out, ('--estimate', 'gains,axes,bend'))
 
 
 def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:

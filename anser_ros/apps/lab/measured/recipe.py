@@ -96,14 +96,14 @@ class Recipe:
         return shared / 'measured' / (self.folder or self.name)
 
 
-def calibrations(bag: Path, out: Path, found: Sequence[str] = ()) -> list[list[str]]:
-    """Return the commands that calibrate a session with sensors as stated, and as found.
+def calibrations(bags: list[Path], out: Path, found: Sequence[str] = ()) -> list[list[str]]:
+    """Return the commands that calibrate the first session with sensors as stated, and as found.
 
     Their models and reports are ``plain`` and ``full``; ``found`` are the options of the second.
     """
     return [
         [
-            'calibrate', str(bag), *options, '--out', str(out / f'{kind}.yaml'),
+            'calibrate', str(bags[0]), *options, '--out', str(out / f'{kind}.yaml'),
             '--report', str(out / kind),
         ]
         for kind, options in (('plain', ('--estimate', 'none')), ('full', found))
