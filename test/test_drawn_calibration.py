@@ -233,7 +233,7 @@ def test_a_board_of_few_emitters_calibrates_by_whole_tools(setup, emitters, seed
     session = world.waved(12.0)
     model = calibrated(session).model
     tracked = track_session(session, model)
-    words = ' '.join(why_withheld(model, tracked))
+    words = ' '.join(why_withheld(model, tracked, session))
     few = r'coils are withheld, state ambiguous in (\d+) of \1 \(3 readings are too few'
     assert bool(words) == (len(emitters) < 5) == bool(re.search(few, words)), words
     series = tracked.bodies['tool']
