@@ -321,7 +321,7 @@ def why_withheld(model: FieldModel, evaluation: Evaluation, session: Session) ->
         return (f'{words}: they read like {wired}; anser diagnose writes a model with that',)
     listed = f'the coils of its calibration (channels {", ".join(map(str, known))})'
     return (
-        f'{words}: the model knows {listed if known else "no coil by itself"}; another one, 2 % '
+        f'{words}: the model knows {listed if known else "no coil by itself"}; any other, 2 % '
         'and 1 deg off as wound by hand, needs a calibration with it; anser diagnose names what '
         'else differs, as metal does',
     )
