@@ -300,7 +300,7 @@ class Tracker:
         silent = [name for name, lives in zip(emitters, living, strict=True) if not lives]
         return (
             f'no flux of {", ".join(silent)}; {living.sum()} emitters are left, '
-            f'{FEWEST_EMITTERS} needed'
+            f'{min(FEWEST_EMITTERS, len(living))} needed'
         )
 
     def _corrected(self, frame: Frame) -> tuple[ComplexArray, Integers]:
