@@ -59,6 +59,7 @@ class LayoutCandidate:
     score: float
     # damping and score (T) for every damping that was tried
     curve: tuple[tuple[float, float], ...]
+    blocks: tuple[float, ...] = ()  # chi-square of each held-out block, in their order
 
 
 class _BodyReadings:
@@ -96,9 +97,8 @@ class LayoutScorer:
         self.placer = placer
         kept = [m.usable.any(axis=1) for m in measurements]
         posed = [with_pose(m) for m in measurements]
-        self.reference = fit = MomentFitter(posed, rich, REFERENCE_DAMPING, accuracy).fit(
-            exact=False
-        )
+        fitter = MomentFitter(posed, rich, REFERENCE_DAMPING, accuracy)
+        self.reference = fit = fitter.fit(exact=False)
         self.noise_t = fit.noise_t
         self._bodies = [
             _BodyReadings(corrected, m, fold[k], weights, rich, fit, pose_precision(accuracy))
@@ -135,7 +135,9 @@ class LayoutScorer:
         scores = self.noise_t * np.sqrt(chi / sum(count for _, count in parts))
         best = int(np.argmin(scores))
         curve = tuple(zip(DAMPINGS, map(float, scores), strict=True))
-        return LayoutCandidate(layout, placed[0], DAMPINGS[best], float(scores[best]), curve)
+        kept = DAMPINGS[best], float(scores[best])
+        blocks = tuple(float(part[best]) for part, _ in parts)
+        return LayoutCandidate(layout, placed[0], *kept, curve, blocks)
 
     def _tables(self, dipoles: DipoleSites) -> tuple[list[Array], dict[int, GramFactor]]:
         matrices = [basis_rows(body.corrected, dipoles) for body in self._bodies]
@@ -203,6 +205,8 @@ FREE = tuple(Layout(kind, 7, 1.0, 0.0, moved=True) for kind in FREE_KINDS)
 LEAST_GAIN = 0.08
 """Fraction by which more dipoles must lower the predictive error to be chosen: below the noise it
 changes no pose, while tracking takes time in proportion to the dipoles."""
+CLEAR_GAIN = 2.13
+"""Standard errors by which blocks must gain from emitters of any shape: Student's 5 % of five."""
 LOSS_FOR_A_THIRD = 1.15
 """Factor by which a finalist's predictive error may be larger if it has a third of the dipoles.
 Where a scan has gaps, some percent of the error of blocks, most of it noise, are half of what the
@@ -276,9 +280,8 @@ class _Search:
 
     def best_layout(self, counts: Sequence[int], height: float) -> LayoutCandidate:
         """Vary count, size, depth and kind in turn; ``height`` is the lowest sensor's, m."""
-        best = self.climb(
-            Layout('layer', counts[len(counts) // 2], EXTENSIONS[1], 0.0, self.prior), counts
-        )
+        middle = Layout('layer', counts[len(counts) // 2], EXTENSIONS[1], 0.0, self.prior)
+        best = self.climb(middle, counts)
         best = self.best_of(best, [replace(best.layout, extension=e) for e in EXTENSIONS])
         best = self.climb(best.layout, counts)
         best = self.best_of(best, [replace(best.layout, depth_m=d * height) for d in DEPTHS])
@@ -295,34 +298,30 @@ class _Search:
 
     def other_finalists(self) -> list[LayoutCandidate]:
         """Return the drawn coils, or what stands for those without a drawing, moved."""
-        found = []
         if self.generator.nominal is None:
             # A few dipoles more cost a tracker nothing: the best of them, not the leanest.
-            straight, free = (
-                min(map(self.score, some), key=lambda c: c.score) for some in (COAXIAL, FREE)
-            )
-            # What has an axis keeps it unless that is clearly wrong.
-            is_clear = free.score * (1.0 + LEAST_GAIN) < straight.score
-            found.append(free if is_clear else straight)
-        else:
-            count = len(self.generator.nominal.positions)
-            if is_of_coils(self.generator.nominal) and count <= MOST_DIPOLES:
-                found.append(self.score(Layout('drawing', count, 1.0, 0.0, self.prior, True)))
-        return found
+            axial, free = (min(map(self.score, k), key=lambda c: c.score) for k in (COAXIAL, FREE))
+            # What has an axis keeps it unless more blocks deny it than chance explains.
+            gain = np.subtract(axial.blocks, free.blocks)
+            is_clear = gain.mean() > CLEAR_GAIN * gain.std(ddof=1) / np.sqrt(gain.size)
+            return [free if is_clear else axial]
+        count = len(self.generator.nominal.positions)
+        if is_of_coils(self.generator.nominal) and count <= MOST_DIPOLES:
+            return [self.score(Layout('drawing', count, 1.0, 0.0, self.prior, True))]
+        return []
 
     def climb(self, start: Layout, counts: Sequence[int]) -> LayoutCandidate:
         """Try finer layers as long as that helps; if none helps, coarser ones."""
         best = self.score(start)
         for direction in (1, -1):
-            improved = False
-            index = counts.index(best.layout.count)
+            before, index = best, counts.index(best.layout.count)
             while 0 <= index + direction < len(counts):
                 index += direction
                 other = self.score(replace(start, count=counts[index]))
                 if other.score >= best.score:
                     break
-                best, improved = other, True
-            if improved:
+                best = other
+            if best is not before:
                 break
         return best
 
