@@ -59,6 +59,8 @@ def diagnose(
         are enough where the emitters are of unknown geometry.
     ModelFileError
         When the model's emitters are not the session's.
+    PlausibilityError
+        When the optical poses are in another frame, unit or order of axes, or delayed.
     BagError
         When the baseline's references are not the session's.
 
