@@ -59,7 +59,6 @@ class LayoutCandidate:
     score: float
     # damping and score (T) for every damping that was tried
     curve: tuple[tuple[float, float], ...]
-    blocks: tuple[float, ...] = ()  # chi-square of each held-out block, in their order
 
 
 class _BodyReadings:
@@ -135,9 +134,7 @@ class LayoutScorer:
         scores = self.noise_t * np.sqrt(chi / sum(count for _, count in parts))
         best = int(np.argmin(scores))
         curve = tuple(zip(DAMPINGS, map(float, scores), strict=True))
-        kept = DAMPINGS[best], float(scores[best])
-        blocks = tuple(float(part[best]) for part, _ in parts)
-        return LayoutCandidate(layout, placed[0], *kept, curve, blocks)
+        return LayoutCandidate(layout, placed[0], DAMPINGS[best], float(scores[best]), curve)
 
     def _tables(self, dipoles: DipoleSites) -> tuple[list[Array], dict[int, GramFactor]]:
         matrices = [basis_rows(body.corrected, dipoles) for body in self._bodies]
@@ -205,8 +202,9 @@ FREE = tuple(Layout(kind, 7, 1.0, 0.0, moved=True) for kind in FREE_KINDS)
 LEAST_GAIN = 0.08
 """Fraction by which more dipoles must lower the predictive error to be chosen: below the noise it
 changes no pose, while tracking takes time in proportion to the dipoles."""
-CLEAR_GAIN = 2.13
-"""Standard errors by which blocks must gain from emitters of any shape: Student's 5 % of five."""
+SHAPE_GAIN = 0.06
+"""Fraction by which emitters of any shape must lower it: sensors' errors that are not estimated
+made 5 % with coils and magnets that have an axis, an AC tracker's own shape 7 % and more."""
 LOSS_FOR_A_THIRD = 1.15
 """Factor by which a finalist's predictive error may be larger if it has a third of the dipoles.
 Where a scan has gaps, some percent of the error of blocks, most of it noise, are half of what the
@@ -301,9 +299,8 @@ class _Search:
         if self.generator.nominal is None:
             # A few dipoles more cost a tracker nothing: the best of them, not the leanest.
             axial, free = (min(map(self.score, k), key=lambda c: c.score) for k in (COAXIAL, FREE))
-            # What has an axis keeps it unless more blocks deny it than chance explains.
-            gain = np.subtract(axial.blocks, free.blocks)
-            is_clear = gain.mean() > CLEAR_GAIN * gain.std(ddof=1) / np.sqrt(gain.size)
+            # What has an axis keeps it unless that is clearly wrong.
+            is_clear = free.score * (1.0 + SHAPE_GAIN) < axial.score
             return [free if is_clear else axial]
         count = len(self.generator.nominal.positions)
         if is_of_coils(self.generator.nominal) and count <= MOST_DIPOLES:
