@@ -77,12 +77,6 @@ def emitter_of(kind: str, geometry: Mapping[str, float], coils: list[Document]) 
     return {'kind': kind, **values, 'coils': coils}
 
 
-def anser_emitter() -> Document:
-    """Return the section of the Anser v1 board."""
-    emitter: Document = read_yaml(read_config(ANSER_FILE))['emitter']
-    return emitter
-
-
 def coil_of(name: str, text: str) -> Document:
     """Return an emitter coil of ``x, y, z, turn about z, tone`` in mm, degrees and Hz."""
     x, y, z, turn, tone = numbers_of(text, 5, f'coil {name}')
@@ -283,7 +277,7 @@ def _document(args: argparse.Namespace) -> Document:
     if args.board == ANSER:
         if coils or args.geometry:
             raise ParameterError('the Anser board has its own coils; name another kind of board')
-        emitter = anser_emitter()
+        emitter: Document = read_yaml(read_config(ANSER_FILE))['emitter']
     else:
         stated = [entry.partition('=') for entry in args.geometry]
         geometry = {key: number_of(value, f'--geometry {key}') for key, _, value in stated}

@@ -24,18 +24,16 @@ SNAPSHOT = 'snapshot of a refit with metal in force'
 
 def load_model(path: str | os.PathLike[str], snapshot: bool = False) -> FieldModel:
     """Read a model file, a refit's snapshot only if wanted; raises `ModelFileError`."""
+    document = read_document(path)
     try:
-        model = from_document(read_document(path))
+        model = from_document(document)
         if is_snapshot(model) and not snapshot:
             raise ModelFileError(
                 f'a {SNAPSHOT} (stamp_ns {model.provenance.get("stamp_ns")}) is not a '
                 'calibration; load the model that the refit started from'
             )
     except ModelFileError as error:
-        text = str(error)
-        raise ModelFileError(
-            text if text.startswith(os.fspath(path)) else f'{path}: {text}'
-        ) from error
+        raise ModelFileError(f'{path}: {error}') from error
     return model
 
 

@@ -311,11 +311,6 @@ TYPE_OF = {layout[0]: number for number, layout in _LAYOUTS.items()}
 """Number of the record type of each class of payload."""
 
 
-def knows(number: int) -> bool:
-    """Return whether this version of the protocol defines record type `number`."""
-    return number in _LAYOUTS
-
-
 def encode(payload: Payload, tag: int = 0) -> bytes:
     """Encode one record, header and CRC included; raises `FrameError` when it is too long."""
     number = TYPE_OF[type(payload)]

@@ -107,7 +107,7 @@ class FrameReader:
             self.counters.wrong_version += 1
             self.last_refusal = f'protocol version {version}, this is version {frames.VERSION}'
             return None
-        if not frames.knows(number):
+        if number not in frames.TYPE_OF.values():
             self.counters.unknown_type += 1
             return None
         try:
@@ -238,7 +238,12 @@ class StreamControl:
             if self._agree(payload):
                 self.refusal = ''
             elif not self._may_set or self._refused:
-                self.refusal = self.refusal or _disagreement(self._wanted, payload)
+                have, want = (
+                    ', '.join(f'{tone:g}' for tone in tones)
+                    for tones in (payload.frequencies_hz, self._wanted)
+                )
+                words = f'the control unit drives {have} Hz, but the setup requires {want} Hz'
+                self.refusal = self.refusal or words
         elif isinstance(payload, frames.Reply) and payload.code is frames.ReplyCode.OK:
             if payload.command == frames.TYPE_OF[frames.Start]:
                 self.started = True
@@ -274,9 +279,3 @@ class StreamControl:
             abs(have - want) <= _TONE_TOLERANCE_HZ
             for have, want in zip(hello.frequencies_hz, self._wanted, strict=True)
         )
-
-
-def _disagreement(wanted: tuple[float, ...], hello: frames.Hello) -> str:
-    have = ', '.join(f'{tone:g}' for tone in hello.frequencies_hz)
-    want = ', '.join(f'{tone:g}' for tone in wanted)
-    return f'the control unit drives {have} Hz, but the setup requires {want} Hz'

@@ -69,12 +69,12 @@ def read_yaml(text: str) -> Any:
     return yaml.load(text, Loader=_LOADER)
 
 
-def read_own_yaml(text: str, what: str) -> Any:
-    """Return a document of ours as plain data; raises `SetupError`, which names what it is."""
+def read_own_yaml(text: str, what: str, kind: type[AnserError] = SetupError) -> Any:
+    """Return a document of ours as plain data; raises a kind, which names what it is."""
     try:
         return read_yaml(text)
     except (yaml.YAMLError, ValueError) as error:  # of which UnicodeError is one
-        raise SetupError(f'{what}: not YAML: {" ".join(str(error).split())}') from error
+        raise kind(f'{what}: not YAML: {" ".join(str(error).split())}') from error
 
 
 def _check(text: str) -> None:
@@ -108,12 +108,7 @@ def _check(text: str) -> None:
 
 def read_document(path: str | os.PathLike[str], schema: str = '') -> Any:
     """Parse a model file; raises `ModelFileError` when it is no YAML of the schema, if any."""
-    text = read_text(path, ModelFileError)
-    try:
-        found = read_yaml(text)
-    except (yaml.YAMLError, ValueError) as error:
-        words = ' '.join(str(error).split())
-        raise ModelFileError(f'{os.fspath(path)}: not YAML: {words}') from error
+    found = read_own_yaml(read_text(path, ModelFileError), os.fspath(path), ModelFileError)
     if schema and (not isinstance(found, dict) or found.get('schema') != schema):
         raise ModelFileError(f'{os.fspath(path)}: its schema must be {schema}')
     return found
