@@ -33,9 +33,12 @@ def test_exact_for_the_signal_that_it_models(milliseconds):
 
 
 @pytest.mark.parametrize(('milliseconds', 'motion'), [(5, False), (20, True), (20, False)])
-def test_stated_noise_is_the_noise(milliseconds, motion):
+def test_stated_noise_is_the_noise(milliseconds, motion, monkeypatch):
     samples = round(RATE * milliseconds / 1e3)
-    demodulator = Demodulator(RATE, TONES, samples, follow_motion=motion)
+    if not motion:
+        monkeypatch.setattr(demodulation, '_AFFORDABLE_VARIANCE_RATIO', 0.0)
+    demodulator = Demodulator(RATE, TONES, samples)
+    assert demodulator.follows_motion == motion
     truth = phasors(200, 1)
     noise = 3.0 * np.random.default_rng(2).standard_normal((samples, 200))
     fit = demodulator.demodulate(waves(truth, samples) + noise)
@@ -55,12 +58,14 @@ def test_the_page_states_what_a_fit_costs_in_variance():
     def variance(milliseconds, **options):
         """Of the mean phasor, over that of one tone alone."""
         count = round(40 * milliseconds)
-        fit = Demodulator(40e3, tones, count, **options).demodulate(noise((count, 1)))
+        demodulator = Demodulator(40e3, tones, count, **options)
+        assert demodulator.follows_motion == (milliseconds >= 10)
+        fit = demodulator.demodulate(noise((count, 1)))
         return float(np.mean((fit.sigma / fit.noise) ** 2) * count / 2)
 
-    motion = [variance(ms, follow_motion=True) - 1 for ms in (20, 10)]
-    plain = variance(5, follow_motion=False)
-    mains = variance(5, follow_motion=False, mains_hz=50.0) / plain - 1
+    motion = [variance(ms) - 1 for ms in (20, 10)]
+    plain = variance(5)
+    mains = variance(5, mains_hz=50.0) / plain - 1
     page = ' '.join((REPO / 'docs' / 'acquisition.md').read_text().split())
     slow, quick = (f'{100 * more:.0f} %' for more in motion)
     assert f'{slow} of variance at 20 ms and {quick} at 10 ms' in page
@@ -68,14 +73,15 @@ def test_the_page_states_what_a_fit_costs_in_variance():
     assert f'170 Hz apart in 5 ms have {plain:.1f} times the variance of one' in page
 
 
-def test_a_moving_coil_does_not_leak_into_other_tones():
+def test_a_moving_coil_does_not_leak_into_other_tones(monkeypatch):
     samples = 800
     truth = np.zeros((1, 8), complex)
     truth[0, 3] = 10000
     ramp = 1 + 0.04 * np.linspace(-0.5, 0.5, samples)[:, None]
     moving = waves(truth, samples) * ramp
     followed = Demodulator(RATE, TONES, samples).demodulate(moving)
-    plain = Demodulator(RATE, TONES, samples, follow_motion=False).demodulate(moving)
+    monkeypatch.setattr(demodulation, '_AFFORDABLE_VARIANCE_RATIO', 0.0)
+    plain = Demodulator(RATE, TONES, samples).demodulate(moving)
     assert np.abs(followed.phasors - truth).max() < 1e-3
     assert np.abs(plain.phasors - truth).max() > 5, 'or the column would not be needed'
 

@@ -85,9 +85,9 @@ class BegunFit:
 class Demodulator:
     """Demodulates windows of a fixed length, with drive tones (K,), by least squares.
 
-    `MAINS_HARMONICS` of ``mains_hz`` are fitted as well, without one that falls on a tone. By
-    default the phasors' rates of change are fitted where that does not double the variance of the
-    phasors (from 10 ms on with tones 170 Hz apart); ``follow_motion`` says whether. Raises
+    `MAINS_HARMONICS` of ``mains_hz`` are fitted as well, without one that falls on a tone. The
+    phasors' rates of change are fitted where that does not double the variance of the phasors
+    (from 10 ms on with tones 170 Hz apart); ``follows_motion`` says whether. Raises
     `ParameterError` when the window is not 5 to 50 ms long, or too short to separate two tones.
     """
 
@@ -98,7 +98,6 @@ class Demodulator:
         window_samples: int,
         *,
         mains_hz: float | None = None,
-        follow_motion: bool | None = None,
     ) -> None:
         tones = np.asarray(frequencies_hz, float)
         length_s = window_samples / sample_rate_hz
@@ -109,10 +108,7 @@ class Demodulator:
         from_middle = np.arange(window_samples) - (window_samples - 1) / 2
         self._times_s = np.asarray(from_middle / sample_rate_hz, float)
         harmonics = _kept_harmonics(mains_hz, tones, sample_rate_hz, length_s)
-        tries = [(bool(follow_motion), _WORST_VARIANCE_RATIO)]
-        if follow_motion is None:
-            tries.insert(0, (True, _AFFORDABLE_VARIANCE_RATIO))
-        for motion, worst in tries:
+        for motion, worst in ((True, _AFFORDABLE_VARIANCE_RATIO), (False, _WORST_VARIANCE_RATIO)):
             self.follows_motion = motion
             self._design = _design_matrix(self._times_s, length_s, tones, harmonics, motion)
             try:
