@@ -260,7 +260,8 @@ class StillFitter:
 
     def __init__(self, measurements: Measurements, centres: Array, accuracy: Accuracy) -> None:
         self.measurements, self.accuracy = measurements, accuracy
-        self.model = StillModel(measurements, StillModel.has_quadrature(measurements))
+        is_complex = bool((measurements.flux[measurements.usable].imag != 0.0).any())
+        self.model = StillModel(measurements, is_complex)
         self.points = measurements.placed()[0][measurements.usable]
         self.tree = cKDTree(self.points)
         self.extent = float(np.ptp(self.points, axis=0).max())

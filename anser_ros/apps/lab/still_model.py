@@ -118,11 +118,6 @@ class StillModel:
         self.usable = measurements.usable
         self.tangents = tangents(measurements.sensors.axis)
 
-    @staticmethod
-    def has_quadrature(measurements: Measurements) -> bool:
-        """Return whether any usable reading has an imaginary part."""
-        return bool((measurements.flux[measurements.usable].imag != 0.0).any())
-
     def phasors(self, parts: Array) -> ComplexArray:
         """Return the phasors (..., K) of their parts (..., C)."""
         return as_complex(parts) if self.is_complex else parts.astype(complex)

@@ -508,7 +508,9 @@ def _round(
     took_s = time.monotonic() - began_s
     corrected = folder / 'diagnosis' / 'model.yaml'
     second_s = SECOND_SHARE * duration_s
-    follows = _drifts(corrected, first)
+    served, sensors = load_model(corrected), load_session(first).tools[0].sensors
+    # Only references can follow effects that vary.
+    follows = bool(Correction.of(served.effects, sensors, served.frequencies_hz).drifting)
     say(f'the corrected model is served, {second_s:g} s on another path')
     unit |= {'path_phase_rad': OTHER_PATH_RAD, 'seed': 3}
     baseline = clean if follows else None
@@ -531,12 +533,6 @@ def _round(
         'kept_share': kept,
         'too_busy': min(kept.values()) < LEAST_KEPT,
     }
-
-
-def _drifts(model_file: Path, session: Path) -> bool:
-    """Return whether a model has effects that vary, so that only references can follow them."""
-    model, sensors = load_model(model_file), load_session(session).tools[0].sensors
-    return bool(Correction.of(model.effects, sensors, model.frequencies_hz).drifting)
 
 
 def _diagnose(bag: Path, clean: Path, model: Path, out: Path) -> dict[str, Any]:

@@ -104,7 +104,7 @@ class OpticalFrame(_Frame):
         """Return the derivative by a shift of all poses and a turn about the tracker's origin."""
         out = np.zeros((view.time.size, 6, 6))
         out[:, :3, :3] = np.eye(3)
-        out[:, :3, 3:] = -_cross(view.position - _frame(term).translation)
+        out[:, :3, 3:] = np.cross((view.position - _frame(term).translation)[:, None], np.eye(3))
         out[:, 3:, 3:] = np.eye(3)
         return out
 
@@ -144,15 +144,6 @@ class Mount(_Frame):
         out[:, :3, :3] = body
         out[:, 3:, 3:] = body
         return out
-
-
-def _cross(vectors: Array) -> Array:
-    """Matrices (n, 3, 3) of the cross product with vectors (n, 3)."""
-    out = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
-    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = z, -y, x
-    return out
 
 
 def _frame(term: effect.PoseTerm) -> FrameTerm:
