@@ -17,6 +17,7 @@ from anser_ros.diagnosis.diagnose import WIRING_FRAMES
 from anser_ros.diagnosis.wiring import wiring_faults
 from anser_ros.errors import DiagnosisError, ParameterError
 from anser_ros.field.model import FieldModel
+from anser_ros.fingerprint import fingerprint_of
 from anser_ros.physics.constants import DEGREES
 from anser_ros.pose_states import OK, RESIDUAL
 from anser_ros.sessions.diagnosis import problem_of
@@ -26,7 +27,6 @@ from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import (
     Evaluation,
     PoseSeries,
-    recording_of,
     to_document,
     track_session,
     write_tables,
@@ -257,7 +257,9 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         in_phase=args.in_phase, witnesses=args.witnesses,
         progress=lambda share: tell('tracking', share),
     )  # fmt: skip
-    document = {**to_document(evaluation), 'recording': recording_of(session)}
+    document = to_document(evaluation)
+    # What was recorded, whatever the file is called.
+    document['recording'] = fingerprint_of([tool.flux[:, :1] for tool in session.tools])
     if why := why_withheld(model, evaluation, session):
         document['withheld'] = why[0]
     written = list(output.write_files(args.out, {'evaluation.json': document}))
@@ -267,8 +269,10 @@ def _one(args: argparse.Namespace, tell: output.Tell) -> output.Result:
         jitter_m=session.setup.accuracy.optical_position_m,
     )[-1:]  # fmt: skip
     shown: list[Any] = [output.terminal_table(ERRORS_HEAD, error_rows(document))]
-    if 'refit' in document:
-        shown.append(_refit_line(document['refit']))
+    if refit := document.get('refit'):
+        states = ', '.join(f'{name} in {count} frames' for name, count in refit['states'].items())
+        out = ', '.join(f'{name} in {count}' for name, count in refit['left_out'].items())
+        shown.append(f'refit: {states or "no frame"}; left out: {out or "no reference"}')
     strengths = evaluation.strengths
     notes = (
         *told,
@@ -325,10 +329,3 @@ def why_withheld(model: FieldModel, evaluation: Evaluation, session: Session) ->
         'and 1 deg off as wound by hand, needs a calibration with it; anser diagnose names what '
         'else differs, as metal does',
     )
-
-
-def _refit_line(refit: dict[str, dict[str, int]]) -> str:
-    """What the refit did, in a line."""
-    states = ', '.join(f'{name} in {count} frames' for name, count in refit['states'].items())
-    out = ', '.join(f'{name} in {count}' for name, count in refit['left_out'].items())
-    return f'refit: {states or "no frame"}; left out: {out or "no reference"}'

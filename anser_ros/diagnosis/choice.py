@@ -302,11 +302,6 @@ class Confirmation:
     helps: bool = True
 
     @property
-    def holds(self) -> bool:
-        """Return whether the effect may be named."""
-        return not self.reason
-
-    @property
     def reason(self) -> str:
         """Return why it may not be named, in words; empty where it may."""
         if not self.plausible:
@@ -427,7 +422,7 @@ def doubtful(problem: Problem, fit: Fit) -> list[tuple[Confirmation, Term]]:
     checks = [(_checked(problem, fit, term, noise), term) for term in fitted]
     checks += [(_checked_open(problem, fit, term, white), term) for term in free]
     checks += _unsteady(problem, fit)
-    bad = [(check, term) for check, term in checks if not check.holds]
+    bad = [(check, term) for check, term in checks if check.reason]
     return sorted(bad, key=lambda pair: pair[0].power)
 
 

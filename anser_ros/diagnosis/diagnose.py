@@ -241,8 +241,8 @@ def search_screened(
 def confirm(screened: Screened, search: Search, how: SearchSettings) -> Confirmed:
     """Fit what the search found on more frames, and keep what is the same in all parts."""
     blocks = train_blocks()
-    found, refused = _settled(how.fitter(search.fit.state.problem, blocks), search)
-    last = how.fitter(screened.training(FINAL_FRAMES, found.terms), blocks)
+    found, refused = _settled(Fitter(search.fit.state.problem, blocks, how.iterations), search)
+    last = Fitter(screened.training(FINAL_FRAMES, found.terms), blocks, how.iterations)
     fit = settled(last, refit_spreads(last.problem, found.terms), FINE)
     return Confirmed(fit, screening.without_outliers(screened.whole, fit.terms), refused)
 

@@ -64,12 +64,6 @@ def parts(values: ComplexArray) -> Array:
     return np.concatenate([flat.real, flat.imag], axis=1)
 
 
-def pose_jacobian(view: View) -> Array:
-    """Return the derivative of flux parts by the body's pose, (F, 2 S K, 6): m, rad, fg's axes."""
-    columns = np.concatenate([view.d_position, view.d_turn], axis=2)
-    return parts(np.moveaxis(columns, 2, -1))
-
-
 @dataclass(frozen=True)
 class Whitener:
     """Multiplies each frame by the inverse square root of its covariance."""
@@ -282,7 +276,8 @@ def evaluate(problem: Problem, terms: Sequence[Term]) -> State:
         residual = parts(np.where(good[..., None], tool.flux - view.flux, 0.0))
         weight = good / np.hypot(problem.spread.flux_t, gaps_t)
         weight = np.tile(np.repeat(weight, tool.flux.shape[2], axis=1), 2)
-        pose = pose_jacobian(view) * problem.spread.accuracy.pose_jitter
+        columns = np.moveaxis(np.concatenate([view.d_position, view.d_turn], axis=2), 2, -1)
+        pose = parts(columns) * problem.spread.accuracy.pose_jitter
         whitener = Whitener.of(weight, _with_free(pose, terms, view), pose.shape[2])
         found.append(Part(view, residual, whitener, whitener(residual), blocks))
     if problem.references is not None and problem.references.readings.time.size:

@@ -35,10 +35,6 @@ class SearchSettings:
     finalists: int = 7  # candidates fitted in full in a round, which a round's time goes into
     iterations: int = 8  # most steps of a fit; most settle in fewer
 
-    def fitter(self, problem: Problem, blocks: Integers) -> Fitter:
-        """Return what fits effects on some blocks of a problem with these settings."""
-        return Fitter(problem, blocks, self.iterations)
-
 
 @dataclass(frozen=True)
 class Candidate:
@@ -92,7 +88,7 @@ class FluxSelection(ForwardSelection[Fit]):
         start: Sequence[Term], progress: Progress | None,
     ) -> None:  # fmt: skip
         self._beside, self._how, self.most = beside, how, how.most_effects
-        self._fitter = how.fitter(beside(start), blocks)
+        self._fitter = Fitter(beside(start), blocks, how.iterations)
         self.search = Search(self._fitter.fit(start))
         self._say = progress or (lambda text: None)
         self._most_metals = decisions.MOST_METALS

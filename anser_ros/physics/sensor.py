@@ -50,15 +50,6 @@ class Windings:
         return np.asarray((self.weight != 0.0).any(axis=1))
 
 
-def joined_windings(tables: Sequence['SensorTable']) -> Windings | None:
-    """Return the windings of several tables, one table after the other."""
-    rows: list[Any] = []
-    for table in tables:
-        own = table.windings
-        rows += [()] * len(table) if own is None else [*np.dstack([own.offset, own.weight])]
-    return Windings.of(rows)
-
-
 ARRAYS, NAMES = ('channel', 'position', 'axis', 'length'), ('name', 'body')
 """Columns of a `SensorTable`, beside the windings."""
 
@@ -105,7 +96,11 @@ class SensorTable:
             key: np.concatenate([getattr(table, key) for table in tables]) for key in ARRAYS
         }
         each |= {key: tuple(n for table in tables for n in getattr(table, key)) for key in NAMES}
-        return SensorTable(**each, windings=joined_windings(tables))
+        rows: list[Any] = []
+        for table in tables:
+            own = table.windings
+            rows += [()] * len(table) if own is None else [*np.dstack([own.offset, own.weight])]
+        return SensorTable(**each, windings=Windings.of(rows))
 
     def placed(self, position: Array, rotation: Array) -> tuple[Array, Array]:
         """Return centres (m) and unit axes (..., S, 3) in fg at poses of the sensors' body.

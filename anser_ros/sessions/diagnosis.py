@@ -14,6 +14,7 @@ import numpy as np
 
 from anser_ros import extensions
 from anser_ros.diagnosis.diagnose import SCHEMA, WIRING_FRAMES, Diagnosis, diagnose, screen
+from anser_ros.diagnosis.fit import Fitter
 from anser_ros.diagnosis.problem import Problem, Spread, build_problem, test_blocks, train_blocks
 from anser_ros.diagnosis.search import SearchSettings
 from anser_ros.diagnosis.wiring import wiring_faults
@@ -104,7 +105,8 @@ def _left(problem: Problem, differing: Collection[str]) -> float:
     What stands elsewhere than in any session of a model must not choose another of them.
     """
     screened = screen(problem)
-    fitter = SearchSettings().fitter(screened.training(STAND_FRAMES), train_blocks())
+    some, steps = screened.training(STAND_FRAMES), SearchSettings.iterations
+    fitter = Fitter(some, train_blocks(), steps)
     sites = [effect_named(name).candidates(problem.apparatus) for name in differing]
     alone: list[tuple[Term, ...]] = [(), *((term,) for terms in sites for term in terms)]
     return min(fitter.fit([*screened.known, *terms]).misfit for terms in alone)

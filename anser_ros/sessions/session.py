@@ -136,12 +136,6 @@ def settings_for(
     )
 
 
-def pose_track(stream: PoseStream, start_ns: int) -> PoseTrack:
-    """Return a recorded pose stream on the time axis of a session that starts at a stamp."""
-    time = (stream.stamp_ns - start_ns) * NANO
-    return PoseTrack(np.asarray(time, dtype=np.float64), stream.position, stream.quaternion)
-
-
 def _measurements(
     stream: RecordedFluxes,
     sensors: SensorTable,
@@ -165,7 +159,8 @@ def _measurements(
         position, has_pose = np.zeros((count, 3)), np.ones(count, dtype=bool)
         rotation = np.broadcast_to(np.eye(3), (count, 3, 3))
     elif optical is not None:
-        track = pose_track(optical, start)
+        seen = (optical.stamp_ns - start) * NANO
+        track = PoseTrack(seen.astype(np.float64), optical.position, optical.quaternion)
         position, rotation, has_pose = track.at(time)
     else:
         position, rotation = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)

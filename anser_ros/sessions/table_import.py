@@ -118,12 +118,11 @@ class _Import:
         if not self._entries:
             raise ParameterError('the tables have no complete row')
         if self._setup is None:
-            names = {kind: self._names_of(kind) for kind in (recorded.TRACKED, recorded.OPTICAL)}
-            body = names[recorded.OPTICAL][0] if names[recorded.OPTICAL] else recorded.BODY
-            self._setup_text = recorded.pose_setup(names[recorded.TRACKED], body)
-
-    def _names_of(self, kind: str) -> list[str]:
-        return [t[len(kind) : -len(recorded.ENDING)] for t in self._messages if t.startswith(kind)]
+            tracked, optical = (
+                [t[len(k) : -len(recorded.ENDING)] for t in self._messages if t.startswith(k)]
+                for k in (recorded.TRACKED, recorded.OPTICAL)
+            )
+            self._setup_text = recorded.pose_setup(tracked, [*optical, recorded.BODY][0])
 
     def write(self, out: Path) -> dict[str, int]:
         """Write all by its stamps."""

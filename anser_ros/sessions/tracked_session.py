@@ -19,7 +19,6 @@ from anser_ros.chain.chain import Chain
 from anser_ros.chain.tracking_half import TrackingHalf
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.field.model import FieldModel
-from anser_ros.fingerprint import fingerprint_of
 from anser_ros.physics.rotations import axis_angles, rotation_angles
 from anser_ros.pose_states import OK
 from anser_ros.sessions.baseline import check_place
@@ -260,11 +259,6 @@ def _compared(
 
 SCHEMA = 'anser_evaluation/1'
 """Name of the document's layout, which stands in every such document."""
-
-
-def recording_of(session: Session) -> str:
-    """Return the fingerprint of what was recorded, whatever the file is called."""
-    return fingerprint_of([tool.flux[:, :1] for tool in session.tools])
 
 
 def to_document(evaluation: Evaluation) -> dict[str, Any]:

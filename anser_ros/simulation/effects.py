@@ -268,18 +268,12 @@ def _crossover(unit: Unit, rng: np.random.Generator) -> Drawn:
 
 
 CATALOGUE: dict[str, Callable[[Unit, np.random.Generator], Drawn]] = {
-    'static_metal': _static_metal,
-    'channel_crosstalk': _channel_crosstalk,
-    'time_offset': _time_offset,
-    'clock_rate': _clock_rate,
-    'sensor_axis': _sensor_axis,
-    'sensor_gain': _sensor_gain,
-    'saturation': _saturation,
-    'coil_drift': _coil_drift,
-    'loose_contact': _loose_contact,
-    'gain_ripple': _gain_ripple,
-    'crossover': _crossover,
-}
+    draws.__name__.removeprefix('_'): draws
+    for draws in (
+        _static_metal, _channel_crosstalk, _time_offset, _clock_rate, _sensor_axis, _sensor_gain,
+        _saturation, _coil_drift, _loose_contact, _gain_ripple, _crossover,
+    )
+}  # fmt: skip
 
 
 def draw(name: str, setup: Setup, channels: ChannelCalibration, rng: np.random.Generator) -> Drawn:
