@@ -213,8 +213,9 @@ def test_over_dds_a_finding_is_raised_and_cleared(ros, start, moving, tmp_path):
     start('replay', bag, '--rate', '2', '--loop', '--wait', '4')
     title = f'anser/watcher: sensor_gain (channel {CHANNEL})'
 
-    def is_raised():
-        return lines.get(title, (0,))[0] == 1
+    def is_raised():  # with few optical poses on a busy machine, tools are all there is
+        own = lines.get('anser/watcher', (0, '', {}))[2]
+        return lines.get(title, (0,))[0] == 1 and own.get('compared_with') == OPTICAL
 
     assert spin_until(node, is_raised), f'{lines}\n{watcher.output}'
     _, message, values = lines[title]
@@ -222,7 +223,6 @@ def test_over_dds_a_finding_is_raised_and_cleared(ros, start, moving, tmp_path):
     assert float(values['gain_sigma']) < 1e-3 and 'summary' in values
     own = lines['anser/watcher']
     assert own[0] == 1 and own[1].startswith('sensor_gain (channel 4)')
-    assert own[2]['compared_with'] == OPTICAL
 
     def is_cleared():
         return lines[title][:2] == (0, 'gone') and lines['anser/watcher'][0] == 0
