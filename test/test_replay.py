@@ -121,6 +121,13 @@ def test_a_server_whose_first_refit_is_being_made_is_not_ready(awaits):
     assert look._is_ready('/anser/field_model', fluxes) is not awaits
 
 
+@pytest.mark.parametrize('topic', ['/anser/tool/flux', '/anser/reference/flux'])
+def test_a_server_is_ready_unheard_where_no_reference_is_played(topic):
+    look = object.__new__(readiness.Readiness)
+    look._since_s, look._reports = 0.0, {'anser/field_model': (1.0, {'stamp_ns': '1'})}
+    assert look._is_ready('/anser/field_model', {topic: []}) is topic.endswith('tool/flux')
+
+
 @pytest.mark.parametrize('listener', [100], indirect=True)
 def test_everything_arrives_with_its_stamps(start, listener, tmp_path):
     bag = make_session(tmp_path / 'a.mcap', 100)

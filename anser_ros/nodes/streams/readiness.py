@@ -117,11 +117,15 @@ class Readiness:
 
     def _is_ready(self, name: str, listeners: dict[str, list[str]]) -> bool:
         reported_s, values = self._report(name)
-        # It must have looked at the graph as it is now.
-        is_listening = any(name in names for names in listeners.values())
+        is_server = name.endswith(FIELD_MODEL)
+        takes = '/reference/flux' if is_server else '/tool/flux'
+        # It listens to what of that is played, and has looked at the graph as it is now.
+        is_listening = all(
+            name in names for topic, names in listeners.items() if topic.endswith(takes)
+        )
         if reported_s < self._since_s or not is_listening:
             return False
-        if name.endswith(FIELD_MODEL):
+        if is_server:
             return bool(values.get('stamp_ns')) and values.get('awaits_refit') != str(True)
         served = self._report(f'{self._home}/{FIELD_MODEL}')[1].get('stamp_ns', '')
         has_model = not served or values.get('model_stamp_ns') == served
