@@ -3,6 +3,7 @@
 import itertools
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,12 @@ from anser_ros.cli.diagnosis_words import MOST_CHARACTERS, short_ones, value_tex
 from anser_ros.cli.main import main
 from anser_ros.effects.effect import all_effects
 from anser_ros.effects.moving_metal import StraightPath
+from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import plain
+from anser_ros.sessions import diagnosis as sessions_diagnosis
 from anser_ros.sessions.diagnosis import DEPENDENCIES, MODEL_FILE_ONLY
 from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import load_model
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.bag_writer import SessionWriter
 
@@ -87,6 +91,28 @@ def test_metal_that_moves_is_found_and_its_verdict_is_short(tmp_path, capsys):
     assert 'moving_metal' in names
     said = [line for line in capsys.readouterr().out.split('\n') if 'residual on' in line]
     assert len(said) == 1 and 100 < len(said[0]) < MOST_CHARACTERS
+
+
+@pytest.mark.parametrize('reverses', [True, False])
+def test_reversed_phases_are_told_before_any_effect(reverses, monkeypatch):
+    class Searches(Exception):
+        """What comes after the check."""
+
+    def search(problem, model, progress):
+        raise Searches
+
+    monkeypatch.setattr(sessions_diagnosis, 'diagnose', search)
+    session, model = load_session(BAGS / 'moving.mcap'), load_model(MODEL)
+    phases = np.exp(0.01j * np.arange(len(model.emitters)))
+    [tool] = session.tools
+    flux = tool.flux * phases
+    tool = replace(tool, flux=flux.conj() if reverses else flux)
+    session, model = (
+        replace(session, tools=(tool,)),
+        replace(model, moments=model.moments * phases),
+    )
+    with pytest.raises(PlausibilityError if reverses else Searches):
+        sessions_diagnosis.diagnose_session(session, model)
 
 
 def test_the_session_needs_poses(tmp_path, capsys):

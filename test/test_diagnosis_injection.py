@@ -95,9 +95,22 @@ def test_nothing_is_named_that_the_model_may_be_wrong_by():
     gain = np.full((1, 3), 1.001)
     assert set(changed(gain)) == {'common_gain'}
     assert not changed(gain, flux_t=2e-9)
+    half = changed(gain, flux_t=2.5e-10)
+    assert set(half) == {'common_gain'}, 'no model is wrong by one effect alone'
     assert not changed(gain, gaps_t=2e-9)
     hit = np.where(np.arange(375)[:, None] % 40, gain, [[1.1, 0.9, 1.0]])
     assert set(changed(hit, flux_t=6e-9)) == {'outliers'}, 'which are not the model'
+
+
+def test_a_drift_that_goes_on_ends_where_it_did_at_the_longest_time_constant():
+    effect, duration = all_effects()['common_drift'], 600.0
+    [zero] = effect.candidates(replace(world(1, 60, 2).problem().apparatus, duration=duration))
+    for tau_s, kept in ((6000.0, 1500.0), (100.0, 100.0), (0.01, 0.3)):
+        free = zero.with_theta(np.array([0.02, np.log(tau_s)]))
+        bounded = effect.bounded(free)
+        assert np.exp(bounded.theta[1]) == pytest.approx(kept)
+        end = [effect.emitter_matrix(t, np.array([duration]), np.ones(1)) for t in (free, bounded)]
+        np.testing.assert_allclose(*end)
 
 
 def test_a_number_of_every_frame_has_the_range_of_its_constant_effect():
@@ -194,3 +207,21 @@ def test_what_a_model_misses_at_a_place_is_no_contact_that_fails():
     moving, resting = session(False, missed), session(True, missed)
     assert outlying_share(moving, without_outliers(moving))[0] > 0.9 * HIT.size / 500
     assert outlying_share(resting, without_outliers(resting)) == (0.0, [])
+
+
+def noisy(flux):
+    """A channel with twenty times the noise, and what a model misses slowly everywhere."""
+    rng, slow = np.random.default_rng(4), np.sin(0.1 * np.arange(len(flux)))[:, None, None]
+    flux += NOISE_T * slow
+    flux[:, 1] += (
+        20.0
+        * NOISE_T
+        * (rng.normal(size=flux[:, 1].shape) + 1j * rng.normal(size=flux[:, 1].shape))
+    )
+
+
+def test_noise_of_a_channel_is_named_beside_what_the_model_may_be_wrong_by():
+    problem = replace(session(True, noisy), references=None)
+    problem = replace(problem, spread=replace(problem.spread, flux_t=2.0 * NOISE_T))
+    [record] = [f.record for f in diagnose(problem, world(3).model).findings]
+    assert (record.name, record.channels) == ('excess_noise', [1])

@@ -8,7 +8,7 @@ from diagnosis_world import world
 from scipy.spatial.transform import Rotation
 
 from anser_ros.diagnosis.problem import evaluate
-from anser_ros.diagnosis.wiring import rightly_wired, scan_faults, wiring_faults
+from anser_ros.diagnosis.wiring import rightly_wired, scan_faults, wiring_faults, without_dead
 from anser_ros.effects.effect import Term, effect_named
 from anser_ros.physics.pose_track import PoseTrack
 
@@ -94,6 +94,16 @@ def test_faults_of_wiring_are_named_and_undone(fault, expected):
     for name, stated in expected.items():
         assert said(found[name]) == {**said(found[name]), **stated}
     assert misfit < 1.2
+
+
+@pytest.mark.parametrize('dead', [slice(50, None), slice(None)])
+def test_frames_without_an_emitter_that_gives_at_times_do_not_count(dead):
+    made = world(seed=2, frames=100, emitters=3)
+    flux = made.tool.flux.copy()
+    flux[dead, :, 1] = 0.0
+    made.flux(flux)
+    counted = without_dead(made.problem()).good[0].any(axis=1)
+    np.testing.assert_array_equal(counted, flux[:, :, 1].any() <= flux[:, :, 1].any(axis=1))
 
 
 def test_a_turned_body_turns_its_own_sensors_and_no_other():

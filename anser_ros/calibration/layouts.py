@@ -89,7 +89,8 @@ def _one_source(
     """Place, axis and spacing of one emitter's source, from rows (P, ...) and fluxes (P, 2)."""
     points, normals, lengths, root, flux = rows
     weighted = flux * root[:, None]
-    first = _best_vector(rows, centre)
+    moments, _ = _one_vector(rows, centre)
+    first = moments[:, int(np.argmax((moments**2).sum(axis=0)))]  # which explains the fluxes best
     if np.linalg.norm(first) > 0.0:
         axis = first / np.linalg.norm(first)
     spacing = SPREAD * near
@@ -111,12 +112,6 @@ def _one_source(
     solution = least_squares(lambda x: left(x) / size, np.zeros(5), ftol=ENDED, xtol=1e-9)
     x = np.asarray(solution.x)
     return centre + near * x[:3], tilted(axis[None], x[None, 3:])[0], spacing
-
-
-def _best_vector(rows: Rows, centre: Array) -> Array:
-    """Moment vector (real part) of one dipole at a place that explains the fluxes best."""
-    moments, _ = _one_vector(rows, centre)
-    return np.asarray(moments[:, int(np.argmax((moments**2).sum(axis=0)))])
 
 
 def _one_vector(rows: Rows, centre: Array) -> tuple[Array, Array]:

@@ -238,7 +238,14 @@ def check_measurements(
         raise FitError(
             f'{needed} dipoles need at least {needed} readings per emitter, got {readings}'
         )
-    _check_thickness(measurements)
+    got, need, widest = _thickness(measurements)
+    if got < need:
+        if widest < need:
+            raise FitError(f'all readings lie within {1e3 * widest:.2g} mm rms: are places in m?')
+        raise FitError(
+            f'all readings lie in one plane: their spread across it must be at least '
+            f'{1e3 * need:.2f} mm rms, got {1e3 * got:.2f} mm'
+        )
     return readings
 
 
@@ -288,17 +295,6 @@ def _thickness(measurements: Sequence[Measurements]) -> tuple[float, float, floa
     points = np.concatenate([m.placed()[0][m.usable] for m in measurements])
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
     return float(spread[-1]), max(FLATTEST * float(spread[0]), THINNEST_M), float(spread[0])
-
-
-def _check_thickness(measurements: Sequence[Measurements]) -> None:
-    got, need, widest = _thickness(measurements)
-    if got < need:
-        if widest < need:
-            raise FitError(f'all readings lie within {1e3 * widest:.2g} mm rms: are places in m?')
-        raise FitError(
-            f'all readings lie in one plane: their spread across it must be at least '
-            f'{1e3 * need:.2f} mm rms, got {1e3 * got:.2f} mm'
-        )
 
 
 def check_agreement(

@@ -371,6 +371,7 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
     each = zip(calibration.model.emitters, inside.each_t, held_out.error.T, strict=True)
     nominal = calibration.nominal_rmse_t
     drawn = calibration.emitters or [{}] * len(calibration.model.emitters)
+    every = np.concatenate([w.ravel() for w in fit.weights])
     return {
         'schema': 'anser_calibration/1',
         'n_measurements': calibration.n_measurements,
@@ -388,7 +389,7 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
             'heldout_component_rmse_t': float(np.sqrt(np.mean(as_real(held_out.left_over) ** 2))),
             'heldout_chi_square': held_out.chi_square,
             'fit_noise_t': fit.noise_t,
-            'outlier_fraction': _outlier_fraction(fit.weights),
+            'outlier_fraction': float((every[every > 0.0] < OUTLIER_WEIGHT).mean()),
         },
         **_by_pose(held_out),
         'choice': {
@@ -432,8 +433,3 @@ def _optical(noise: OpticalNoise) -> dict[str, Any]:
     sizes = {key: getattr(noise, key) for key in ('position_m', 'rotation_rad')}
     relative = noise.relative_uncertainty
     return {**sizes, 'uncertainty': {key: relative * size for key, size in sizes.items()}}
-
-
-def _outlier_fraction(weights: Sequence[Array]) -> float:
-    every = np.concatenate([w.ravel() for w in weights])
-    return float((every[every > 0.0] < OUTLIER_WEIGHT).mean())

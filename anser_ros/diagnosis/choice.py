@@ -16,7 +16,7 @@ from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.engine import BlockSums, Score, Scorer
 from anser_ros.diagnosis.fit import Fit, Fitter, settled
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate, parts
-from anser_ros.diagnosis.screening import known_variance, noise_scale
+from anser_ros.diagnosis.screening import known_variance, model_share, noise_scale
 from anser_ros.effects.base import View
 from anser_ros.effects.effect import INEXACT, Family, FluctuationTerm, Term, all_effects
 from anser_ros.parallel import in_order
@@ -207,26 +207,14 @@ def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
     if steady:
         gain, best = max(steady, key=lambda pair: pair[0])
     most, is_metal = best.newest.complexity, best.newest.effect.family.is_metal
-    simpler = [
-        (g, f)
-        for g, f in fitted
-        if f.newest.complexity < most
-        and (
-            gain - g < decisions.as_good(most - f.newest.complexity) * max(best.misfit, 1.0)
-            or (
-                is_metal
-                and not f.newest.effect.family.is_metal
-                and g > (1.0 - decisions.ALIKE) * gain
-            )
-        )
-    ]
-    simpler += [
-        (g, f)
-        for g, f in fitted
-        if f.newest.effect.family is Family.FLUCTUATION
-        and f.newest.complexity < most
-        and at_floor(f)
-    ]
+
+    def is_as_good(own: float, fit: Fit) -> bool:
+        spared, family = most - fit.newest.complexity, fit.newest.effect.family
+        less = gain - own < decisions.as_good(spared) * max(best.misfit, 1.0)
+        plain = is_metal and not family.is_metal and own > (1.0 - decisions.ALIKE) * gain
+        return spared > 0 and (less or plain or (family is Family.FLUCTUATION and at_floor(fit)))
+
+    simpler = [pair for pair in fitted if is_as_good(*pair)]
     if not simpler:
         return gain, best
     return min(simpler, key=lambda pair: (pair[1].newest.complexity, -pair[0]))
@@ -290,7 +278,9 @@ class Confirmation:
     """Holds what speaks for an effect."""
 
     power: float  # what it takes off the sum of squares
-    variation: float  # share of that power that refits in parts of the data take off besides
+    # What refits in parts of the data take off besides, as a share of that power and of what the
+    # model states as its own error, which differs from one part to the next.
+    variation: float
     share_of_rest: float  # its power over the power that stays unexplained
     # Share of its power that stays on the channels and emitters that it changes, beyond what stays
     # everywhere. Metal is exempt: its shape is never known.
@@ -326,12 +316,12 @@ def _checked(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmati
     power = without.sum_of_squares - fit.state.sum_of_squares
     left = max(fit.state.sum_of_squares - noise * fit.state.count, 0.0)
     left_tools = left if fit.misfit > decisions.SOMETHING_LEFT * noise else 0.0
-    columns = fit.state.design(term)
+    columns, own = fit.state.design(term), model_share(fit.state) * fit.state.count
     remainder = 0.0
     if np.isfinite(term.effect.inexact):
         remainder = _stays(fit.state, columns, noise, max(1.0, decisions.MODEL_ERROR * noise))
     return Confirmation(
-        power, _varying(fit.state, columns, noise) / max(power, 1e-300),
+        power, _varying(fit.state, columns, noise) / max(power + own, 1e-300),
         power / max(left_tools, 1e-300), remainder / max(power, 1e-300),
         inexact=term.effect.inexact, alike=_crowd(fit, term), plausible=_plausible(term),
         helps=_helps(without, fit.state, columns),

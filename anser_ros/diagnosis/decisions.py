@@ -94,9 +94,13 @@ got a loose axis that explains 0.015 (`docs/log.md`)."""
 REMNANT = 0.01
 """Further metal with less than this share of the strongest metal's gain is what the model of that
 one left."""
+OWN_SHARE = 0.5
+"""The same for any other effect. What a model misses has many shapes, of which one effect is part:
+at most 0.42 of what the model stated, in 27 good recordings of a real tracker. Smaller names such
+a part; larger misses what changed by less than the model states to be wrong by."""
 OWN_METAL = 2.0
 """Gain of metal at rest, over the power that the model states of its own error, everywhere and by
-place, in all readings (of any other effect 1), below which it may be the model's: what was taken
+place, in all readings, below which it may be the model's: what was taken
 off a scan with metal near leaves a field that is metal's, 1.1 times that power in
 `dirty/scan_metal`, the only one tried. Larger hides faint metal (what moves a tool by 0.03 mm)."""
 COMPLETE = 3.0
@@ -179,10 +183,11 @@ TIME_PARTS = 6
 """Parts of the session in which an effect is fitted again: enough to see a change, few enough that
 each has the poses that tell the parameters."""
 LARGEST_VARIATION = 0.1
-"""Share of an effect's power that refits in parts of the data may take off besides. What is
-truly there varies by what its model is wrong by (`Effect.inexact`: 1 % for most), and by chance:
-normal noise alone lets the refits of six parts of the time take off some 3 with one parameter each
-and 8 with six, which is a share only of an effect of little power. Larger confirms what stands in
+"""Share of an effect's power, and of what the model states as its own error, that refits in parts
+of the data may take off besides. What is truly there varies by what its model is wrong by
+(`Effect.inexact`: 1 % for most), and by chance: normal noise alone lets the refits of six parts of
+the time take off some 3 with one parameter each and 8 with six, which is a share only of an effect
+of little power. Larger confirms what stands in
 for another effect; smaller refuses effects whose model is only near the truth, as metal's is."""
 LEAST_OF_THE_REST = 0.2
 """An effect that takes off less than this share of what stays unexplained is not named: something
@@ -216,8 +221,10 @@ that are another effect's, and with no bound a hum; smaller leaves true ones unn
 small unknown (`docs/log.md`)."""
 
 # Each of the next four lies above all that normal noise reached in 200 draws of 100 frames with 48
-# readings, the fewest of a watch on two clusters and four coils; more frames or readings reach
-# less.
+# readings; more frames or readings reach less.
+BOUNDED_VALUES = 4800
+"""Values on which these were chosen: of fewer, noise alone reaches more, by the root of the share.
+"""
 LEAST_CORRELATION = 0.06
 """Correlation (-1 to 1) with a frame before from which residuals have a memory, just above the
 0.053 that normal noise reached. Smaller refuses true noise; larger lets a hum pass for it."""

@@ -3,7 +3,7 @@
 First what describes the findings: fitted effects, outliers, noise, and the model with all of them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -20,7 +20,6 @@ from anser_ros.diagnosis.problem import (
     expected_rms,
     rms,
     test_blocks,
-    tool_parts,
     train_blocks,
 )
 from anser_ros.diagnosis.search import FluxSelection, Progress, Search, SearchSettings
@@ -90,18 +89,14 @@ def outlier_findings(
     return [plain_finding(outliers_of(share, sigma, channels), rms(after))]
 
 
-def noise_findings(whole: Problem, after: State) -> list[Finding]:
-    """Return excess noise, of all channels or of those that have it."""
+def noise_findings(whole: Problem, after: State, noisy: Mapping[int, float]) -> list[Finding]:
+    """Return excess noise, of all channels or of those that have it (`noisy_channels`)."""
     factor = screening.noise_t(after) / whole.spread.noise_t
     if factor <= decisions.LEAST_NOISE_GROWTH:
         return []
-    power = {c: own.mean() for part in tool_parts(after) for c, own in part.power().items()}
-    noisy = [c for c, own in power.items() if own > decisions.LEAST_NOISE_GROWTH**2]
-    if len(noisy) == len(power):  # where no others have none, it is that of all
-        noisy = []
     count: float = after.count
     if noisy:
-        size = float(np.sqrt(np.mean([power[c] for c in noisy])))
+        size = float(np.sqrt(np.mean([*noisy.values()])))
         factor = size * whole.spread.flux_t / whole.spread.noise_t
         count *= len(noisy) / len(whole.apparatus.tool_channels)
     sigma = factor / np.sqrt(2 * max(count, 1))
@@ -284,7 +279,8 @@ def conclude(
     whole, cleaned, fit = screened.whole, confirmed.cleaned, confirmed.fit
     unseen = cleaned.in_blocks(test_blocks())
     before, after = evaluate(unseen, ()), evaluate(unseen, fit.terms)
-    depending = screening.not_white(after)
+    noisy = screening.noisy_channels(after)
+    depending = screening.not_white(after, [*noisy])
     expected = expected_rms(after)
     # Residuals that are no noise must not make the floor that they are measured by.
     grown = screening.noise_t(after) > decisions.LEAST_NOISE_GROWTH * cleaned.spread.noise_t
@@ -294,7 +290,10 @@ def conclude(
     tests = tuple(screening.structure_tests(after))
     excess = max(rms(after) ** 2 - floor**2, 0.0)
     named = [test.variable for test in tests if test.significant]
-    significant = excess > (decisions.STRUCTURED if named else decisions.UNSTRUCTURED) * floor**2
+    # Noise of some channels alone differs from channel to channel, too.
+    alone = screening.GROUPED if noisy and not depending else ()
+    least = decisions.STRUCTURED if {*named}.difference(alone) else decisions.UNSTRUCTURED
+    significant = excess > least * floor**2
     possible = max(rms(before) ** 2 - floor**2, excess)
     findings = [
         fitted_finding(fit, i, unseen, search)
@@ -304,7 +303,7 @@ def conclude(
     own = rms(after) ** 2 / max(floor, expected) ** 2 - 1.0
     findings += outlier_findings(whole, cleaned, after, own, model.effects)
     if not significant:
-        findings += noise_findings(whole, after)
+        findings += noise_findings(whole, after, noisy)
     records = [finding.record for finding in findings]
     depends: tuple[str, ...] = ()
     if excess > decisions.DEPENDENT * floor**2:

@@ -89,6 +89,7 @@ def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
 BINS = 12
 """Cells into which frames are binned by one variable, tens of frames in each."""
 BINNED = ('time', 'position', 'orientation', 'speed', 'amplitude')  # by which frames are binned
+GROUPED = ('channel', 'emitter', 'quadrature')
 FEWEST_CELL_VALUES = 4
 """Values that a cell needs for its mean to be compared: fewer add more noise than information."""
 
@@ -117,7 +118,7 @@ def structure_tests(state: State) -> list[StructureTest]:
     tools = tool_parts(state)
     noise = _noise(tools)
     tests = [_binned(tools, name, noise) for name in BINNED]
-    tests += [_grouped(tools, name, noise) for name in ('channel', 'emitter', 'quadrature')]
+    tests += [_grouped(tools, name, noise) for name in GROUPED]
     return sorted(tests, key=lambda test: -round(test.share, 9))  # which a rounding does not swap
 
 
@@ -241,13 +242,25 @@ OUTLYING = 4.5
 """Standard deviations beyond which a value is not used here: one alone would make a kurtosis."""
 
 
-def not_white(state: State) -> tuple[str, ...]:
+def noisy_channels(state: State) -> dict[int, float]:
+    """Return mean squares of tools' channels that are larger than expected, if not of all.
+
+    Taking the pose out spreads a trace of each channel's noise over all.
+    """
+    power = {c: own.mean() for part in tool_parts(state) for c, own in part.power().items()}
+    least = max(decisions.LEAST_NOISE_GROWTH**2, decisions.CHANGED * max(power.values()))
+    noisy = {c: float(own) for c, own in power.items() if own > least}
+    return noisy if len(noisy) < len(power) else {}
+
+
+def not_white(state: State, channels: Sequence[int] = ()) -> tuple[str, ...]:
     """Return what the tools' residuals, each over the spread of its own kind, depend on.
 
-    In the words of `docs/interfaces.md`; nothing where they may be called noise.
+    Of some channels where these are noisy. In the words of `docs/interfaces.md`; nothing where
+    they may be called noise.
     """
     tools = [part for part in tool_parts(state) if part.white.shape[0] > 2 * LAGS]
-    values = [_scaled(part) for part in tools]
+    values = [_scaled(part, channels) for part in tools]
     pairs = list(zip(tools, values, strict=True))
     found: list[str] = []
     if any(_memory(part, v) > decisions.LEAST_CORRELATION for part, v in pairs):
@@ -260,14 +273,23 @@ def not_white(state: State) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _scaled(part: Part) -> Array:
-    """Residuals over the spread of their column; NaN where there is none or it stands out."""
+def _scaled(part: Part, channels: Sequence[int]) -> Array:
+    """Residuals over the spread of their column; NaN where there is none, or of other channels."""
     good = part.whitener.weight > 0
+    if channels:
+        good &= np.tile(
+            np.repeat(np.isin(part.view.sensors.channel, channels), part.view.omega.size), 2
+        )
     white = np.where(good, part.white, np.nan)
     count = np.maximum(good.sum(axis=0), 1)
     size = np.sqrt(np.nansum(white**2, axis=0) / count)
     out = white / np.where(size > 0, size, 1.0)
     return np.where(np.abs(out) < OUTLYING, out, np.nan)
+
+
+def _sure(figure: float, values: int) -> float:
+    """What so many values give, as far as fewer than the bounds were chosen on show it."""
+    return figure * min(1.0, float(np.sqrt(values / decisions.BOUNDED_VALUES)))
 
 
 def _memory(part: Part, values: Array) -> float:
@@ -281,7 +303,8 @@ def _memory(part: Part, values: Array) -> float:
             continue
         one, other = known[lag:][near], known[:-lag][near]
         power = np.sqrt(float(np.sum(one**2)) * float(np.sum(other**2)))
-        most = max(most, abs(float(np.sum(one * other))) / max(power, 1e-300))
+        share = abs(float(np.sum(one * other))) / max(power, 1e-300)
+        most = max(most, _sure(share, int(np.count_nonzero(one))))
     return most
 
 
@@ -307,10 +330,10 @@ def _with_size(part: Part, values: Array) -> float:
     a, b = values[known] ** 2, size[known]
     a, b = a - a.mean(), b - b.mean()
     power = np.sqrt(float(a @ a) * float(b @ b))
-    return float(float(a @ b) / power) if power > 0 else 0.0
+    return _sure(float(a @ b) / power, a.size) if power > 0 else 0.0
 
 
 def _kurtosis(values: list[Array]) -> float:
     known = np.concatenate([v[np.isfinite(v)] for v in values])
     # A normal distribution cut at OUTLYING has a kurtosis of 2.99.
-    return float(np.mean(known**4) / np.mean(known**2) ** 2 - 2.99)
+    return _sure(float(np.mean(known**4) / np.mean(known**2) ** 2 - 2.99), known.size)

@@ -73,8 +73,8 @@ def _may_be_the_model_s(gain: float, fit: Fit) -> bool:
     """Whether an effect explains no more than what the model may have of its own."""
     own = model_share(fit.state) * fit.state.count
     if fit.newest.effect.family is Family.METAL_AT_REST:
-        own *= decisions.OWN_METAL * max(fit.misfit, 1.0)
-    return gain < own
+        return gain < decisions.OWN_METAL * max(fit.misfit, 1.0) * own
+    return gain < decisions.OWN_SHARE * own
 
 
 class FluxSelection(ForwardSelection[Fit]):
@@ -103,7 +103,7 @@ class FluxSelection(ForwardSelection[Fit]):
         metal = _metal_beside(best, gain, fitted)
         if metal is not None:
             # A freedom in every frame is no match for metal before that has its shape.
-            shaped = choice.moves_or_rests(self._fitter, metal[1], fitted, self._others, metal[0])
+            shaped = choice.moves_or_rests(self._fitter, metal[1], fitted, self._scored, metal[0])
             if scorer.held_out - shaped.held_out() > gain:
                 search.metal_gain = max(search.metal_gain, metal[0])
                 return shaped
@@ -116,15 +116,19 @@ class FluxSelection(ForwardSelection[Fit]):
             if gain < decisions.REMNANT * search.metal_gain:
                 return None
             if term.effect.family is Family.MOVING_METAL:
-                best = choice.moves_or_rests(self._fitter, best, fitted, self._others, gain)
+                best = choice.moves_or_rests(self._fitter, best, fitted, self._scored, gain)
             if is_own or self._is_installed_anew(fit, best, gain):
                 self._most_metals = 0
                 return self._stood_anew(fit, gain) or self.addition(fit)
             search.metal_gain = max(search.metal_gain, gain)
-        search.rivals[term.label] = _rivals(gain, best, fitted)
+        least = gain - decisions.AS_GOOD * max(best.misfit, 1.0) - decisions.ALIKE * abs(gain)
+        alike = [(g, f.newest) for g, f in fitted if f is not best and g > least]
+        search.rivals[term.label] = [Candidate(t, t.theta.size, g, g) for g, t in alike]
         first = max(fitted, key=lambda pair: pair[0])[1].newest
-        if first.effect.rivals(first, term):
-            search.passed[term.label] = first
+        free = [c.term for c in search.rounds[-1] if c.term.effect.family is Family.FLUCTUATION]
+        for other in reversed([first, *free]):
+            if other.effect.rivals(other, term):
+                search.passed[term.label] = other
         if term.effect.family is Family.MOVING_METAL:
             return best
         near = [f for g, f in fitted if f is not best and g > decisions.STEADY * gain]
@@ -246,12 +250,8 @@ class FluxSelection(ForwardSelection[Fit]):
         self.search.rounds.append(sorted(table, key=lambda c: -c.gain))
         return fitted
 
-    def _others(self, scorer: Scorer[State]) -> list[tuple[Term, Score]]:
-        """All candidates but metal, best first."""
-        return self._scored(scorer, 0)
-
-    def _scored(self, scorer: Scorer[State], most_metals: int) -> list[tuple[Term, Score]]:
-        """All candidates that are not active already, best first."""
+    def _scored(self, scorer: Scorer[State], most_metals: int = 0) -> list[tuple[Term, Score]]:
+        """All candidates that are not active already, without metal if not so many, best first."""
         candidates = _candidates(self._fitter.problem, scorer.state.terms, most_metals)
 
         def scored(few: slice) -> list[tuple[Term, Score]]:
@@ -287,16 +287,6 @@ def _candidates(problem: Problem, taken: Sequence[Term], most_metals: int) -> li
         for term in effect.candidates(problem.apparatus)
         # Beside metal a reference's survey error looks like a fault of its channel.
         if not is_covered(term, taken) and (not metals or set(term.channels) <= set(ours))
-    ]
-
-
-def _rivals(gain: float, best: Fit, fitted: Sequence[tuple[float, Fit]]) -> list[Candidate]:
-    """What explained as much as the effect that was taken."""
-    least = gain - decisions.AS_GOOD * max(best.misfit, 1.0) - decisions.ALIKE * abs(gain)
-    return [
-        Candidate(f.newest, f.newest.theta.size, g, g)
-        for g, f in fitted
-        if f is not best and g > least
     ]
 
 

@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
+from anser_ros.arrays import AnyArray, Array, Booleans, ComplexArray, Integers
 from anser_ros.diagnosis import decisions
 from anser_ros.diagnosis.problem import Problem
 from anser_ros.effects.correction import Fields, tool_view
@@ -59,13 +59,13 @@ class _Readings:
         return float(_power(seen - wanted) / np.maximum(_power(seen), 1e-300))
 
 
-def _power(values: ComplexArray, axes: tuple[int, ...] = (0, 1, 2)) -> Array:
+def _power(values: AnyArray, axes: tuple[int, ...] = (0, 1, 2)) -> Array:
     return np.asarray(np.sum(np.abs(values) ** 2, axis=axes))
 
 
-def _silent(seen: ComplexArray, wanted: ComplexArray) -> Booleans:
-    """Booleans (S,) of sensors with hardly any of the reading that they should have."""
-    power, expected = _power(seen, (0, 2)), _power(wanted, (0, 2))
+def _silent(seen: ComplexArray, wanted: ComplexArray, axes: tuple[int, ...] = (0, 2)) -> Booleans:
+    """What has hardly any of the reading that it should have: sensors (S,), or over other axes."""
+    power, expected = _power(seen, axes), _power(wanted, axes)
     return np.asarray((power < decisions.DEAD**2 * expected) & (expected > 0))
 
 
@@ -80,6 +80,20 @@ def wiring_faults(problem: Problem) -> list[Term]:
     if dead := dead + _silent_references(problem):
         found.append(Term(DEAD_CHANNEL, {'channels': tuple(dead)}))
     return found
+
+
+def without_dead(problem: Problem) -> Problem:
+    """Return the problem without the frames in which an emitter is dead that gives at times."""
+    good = []
+    for tool, own in zip(_read(problem, ()), problem.good, strict=True):
+        dead = _silent(tool.seen, tool.wanted, (1,))  # (F, K)
+        good.append(own & ~np.any(dead & ~dead.all(axis=0), axis=1, keepdims=True))
+    return replace(problem, good=tuple(good))
+
+
+def quadrature_left(problem: Problem, known: Sequence[Term]) -> float:
+    """Return the power of imaginary parts, T^2, that predictions leave beside some faults."""
+    return sum(float(_power((t.seen - t.wanted).imag)) for t in _read(problem, known))
 
 
 def _read(problem: Problem, terms: Sequence[Term]) -> list[_Readings]:
@@ -114,7 +128,9 @@ def _rewired(problem: Problem, number: int, known: Sequence[Term]) -> list[Term]
 
     plain = read(())
     none = judged(())
-    ways = [judged([term]) for term in _swapped_channels(plain)]
+    moved = _moved(_likeness([(plain.seen, plain.wanted)]), plain.driven, plain.channels)
+    swaps = [Term(SWAPPED_CHANNELS, {'channels': t, 'read_as': r}) for t, r in moved]
+    ways = [judged([term]) for term in swaps]
     is_wrong = none[1] > 0 or none[0] > 1 - decisions.OTHERS_CORRELATION**2
     for terms in _turns(plain, read) if is_wrong else ():
         way = judged(terms)
@@ -270,13 +286,6 @@ def _moved(
     if not moved.size or set(true) != set(moved):
         return []
     return [(tuple(numbers[true].tolist()), tuple(numbers[moved].tolist()))]
-
-
-def _swapped_channels(tool: _Readings) -> list[Term]:
-    """Channels of a tool that read as another's prediction."""
-    alike = _likeness([(tool.seen, tool.wanted)])
-    pairs = _moved(alike, tool.driven, tool.channels)
-    return [Term(SWAPPED_CHANNELS, {'channels': t, 'read_as': r}) for t, r in pairs]
 
 
 def _swapped_coils(tools: Sequence[_Readings]) -> list[Term]:

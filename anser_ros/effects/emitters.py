@@ -138,18 +138,20 @@ class CoilDrift(Effect[CoilDriftTerm]):
         duration = term.duration
         time = np.linspace(0.0, duration, 60)
         curves = [_shape(time, share * duration) for share in PROBED_SHARES]
-        wanted = sum(a * c for a, c in zip(solution, curves, strict=True))
-        misfits = []
-        for tau in duration * np.geomspace(0.03, 5.0, 25):
-            curve = _shape(time, float(tau))
-            amount = float(curve @ wanted / (curve @ curve))
-            misfits.append((float(np.sum((wanted - amount * curve) ** 2)), amount, np.log(tau)))
-        return (self.bounded(term.with_theta(np.array(min(misfits)[1:]))),)
+        wanted = solution @ curves
+        taus = duration * np.geomspace(0.03, 5.0, 25)
+        tried = np.array([_shape(time, tau) for tau in taus.tolist()])
+        amounts = tried @ wanted / (tried**2).sum(axis=1)
+        best = np.argmin(((wanted - amounts[:, None] * tried) ** 2).sum(axis=1))
+        return (self.bounded(term.with_theta(np.array([amounts[best], np.log(taus[best])]))),)
 
     def bounded(self, term: CoilDriftTerm) -> CoilDriftTerm:
-        """Keep the time constant between a third of a second and 25 minutes."""
+        """Keep the time constant between 0.3 and 1500 s, and the change at the session's end."""
         amount, log_tau = term.theta
-        return term.with_theta(np.array([amount, np.clip(log_tau, np.log(0.3), np.log(1500.0))]))
+        within = np.clip(log_tau, np.log(0.3), np.log(1500.0))
+        end = np.exp(np.log(term.duration) - np.array([max(log_tau, within), within]))
+        amount *= np.divide(*-np.expm1(-end))
+        return term.with_theta(np.array([amount, within]))
 
     def emitter_matrix(self, term: CoilDriftTerm, time: Array, omega: Array) -> ComplexArray:
         matrix = np.repeat(np.eye(omega.size, dtype=complex)[None], time.size, axis=0)

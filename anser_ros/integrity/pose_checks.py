@@ -169,7 +169,10 @@ class Continuity:
             if contradiction and not old:
                 self._jumps.append(stamp_ns)
         self._run, self._frames = [*self._run[-1:], place], self._frames + 1
-        if alone or self._is_confirmed(stamp_ns):
+        # The run must be as long as refusals were lately, up to a bound.
+        needed_s = min(self.refused_share * RECORD_S, LONGEST_RUN_S)
+        is_long = (stamp_ns - self._began_ns) * NANO >= needed_s
+        if alone or (is_long and self._frames >= START_FRAMES):
             self._track = list(self._run)
             return self._against_points() if alone else ''
         if contradiction and not old:
@@ -184,11 +187,6 @@ class Continuity:
         refused, count = sum(self._points), len(self._points)
         against = refused > MOST_REFUSED * count
         return f'{refused} of the last {count} points were refused' if against else ''
-
-    def _is_confirmed(self, stamp_ns: int) -> bool:
-        """Whether the run is long enough: as long as refusals were lately, up to a bound."""
-        needed_s = min(self.refused_share * RECORD_S, LONGEST_RUN_S)
-        return self._frames >= START_FRAMES and (stamp_ns - self._began_ns) * NANO >= needed_s
 
     def _note(self, stamp_ns: int, refused: bool, counts: bool) -> None:
         record = self._record

@@ -51,12 +51,6 @@ SHARE = 0.1
 """Weight of a frame by which a tool's errors are learnt: the model's own repeat in the next."""
 
 
-def coil_spread(count: int, tools: ToolSettings) -> Array:
-    """Return the standard deviations (7 S,) of the errors of tool coils, as `ToolRows.own`."""
-    gain, place, axis = tools.tool_coil_gain, tools.tool_coil_position_m, tools.tool_coil_axis_rad
-    return np.tile([gain, gain, place, place, place, axis, axis], count)
-
-
 def surroundings(points: Array) -> Array:
     """Return coils' places (P, 3), m, and four around each, (5 P, 3): where modes are chosen."""
     return np.asarray((points[:, None] + NEAR_M * _AROUND).reshape(-1, 3))
@@ -82,7 +76,9 @@ class CoilErrors:
     """
 
     def __init__(self, table: SensorTable, tools: ToolSettings) -> None:
-        self._prior = np.maximum(coil_spread(len(table), tools), 1e-9)
+        gain, place = tools.tool_coil_gain, tools.tool_coil_position_m
+        own = [gain] * 2 + [place] * 3 + [tools.tool_coil_axis_rad] * 2  # as `ToolRows.own`
+        self._prior = np.maximum(np.tile(own, len(table)), 1e-9)
         self._precision = np.diag(self._prior**-2.0)
         self._pull = np.zeros(len(self._prior))
         self._solved: tuple[Array, Array] | None = None

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from anser_ros import extensions
+from anser_ros.diagnosis.decisions import BETTER
 from anser_ros.diagnosis.diagnose import SCHEMA, WIRING_FRAMES, Diagnosis, diagnose, screen
 from anser_ros.diagnosis.fit import Fitter
 from anser_ros.diagnosis.problem import Problem, Spread, build_problem, test_blocks, train_blocks
 from anser_ros.diagnosis.search import SearchSettings
-from anser_ros.diagnosis.wiring import wiring_faults
+from anser_ros.diagnosis.wiring import quadrature_left, wiring_faults, without_dead
 from anser_ros.effects.effect import Term, effect_named
 from anser_ros.errors import DiagnosisError, ParameterError, PlausibilityError
 from anser_ros.field.model import SESSION, EffectRecord, FieldModel, plain
@@ -70,14 +71,24 @@ def diagnose_session(
 
     With a baseline, a distortion-free recording of the same board, the references are used.
     ``progress`` is called with words on what goes on. Raises `DiagnosisError` when fewer than 30
-    frames have fluxes and a pose; `PlausibilityError` when the optical poses are grossly off the
-    tracked ones, and no effect is that or mends it; `ModelFileError` when the model's emitters are
-    not the session's; `BagError` when the baseline's references are not the session's.
+    frames have fluxes and a pose; `PlausibilityError` when all phases are reversed, or the optical
+    poses are grossly off the tracked ones, and no effect is that or mends it; `ModelFileError`
+    when the model's emitters are not the session's; `BagError` when the baseline's references are
+    not the session's.
     """
     say = progress or (lambda text: None)
     prepared = prepare(session, model, baseline)
     problem = problem_of(correct(prepared))
-    plugs = wiring_faults(problem.thinned(WIRING_FRAMES))
+    some = problem.thinned(WIRING_FRAMES)
+    plugs = wiring_faults(some)
+    tools = tuple(replace(tool, flux=tool.flux.conj()) for tool in session.tools)
+    mirrored = problem_of(correct(prepared.with_session(replace(session, tools=tools))))
+    as_read = quadrature_left(some, plugs)
+    if quadrature_left(mirrored.thinned(WIRING_FRAMES), plugs) < BETTER * as_read:
+        raise PlausibilityError(
+            f'{session.path}: the phases of all readings are the reverse of those that the model '
+            'makes: imaginary parts with the other sign?'
+        )
     gross = [] if plugs else [one for one in track(prepared).disagreements if one.is_gross]
     for one in gross:
         if one.is_stated:
@@ -102,9 +113,10 @@ def diagnose_session(
 def _left(problem: Problem, differing: Collection[str]) -> float:
     """Misfit of a problem's wiring, and at most one of these effects, by which sessions differ.
 
-    What stands elsewhere than in any session of a model must not choose another of them.
+    What stands elsewhere than in any session of a model must not choose another of them, nor an
+    emitter that is dead for a part of the time.
     """
-    screened = screen(problem)
+    screened = screen(without_dead(problem))
     some, steps = screened.training(STAND_FRAMES), SearchSettings.iterations
     fitter = Fitter(some, train_blocks(), steps)
     sites = [effect_named(name).candidates(problem.apparatus) for name in differing]

@@ -106,7 +106,11 @@ class PoseWatch:
         known = self._known
         if known is None or session.reference is None:
             return float('nan'), (), ''
-        problem = _later_half(pose_problem(session))
+        # A change in the window's first half has left the later one behind.
+        problem = pose_problem(session)
+        ends = np.concatenate([p.time[[0, -1]] for p in problem.sensors])
+        middle = 0.5 * (ends.min() + ends.max())
+        problem = problem.rows([p.time > middle for p in problem.sensors])
         present = {None, *(poses.name for poses in problem.sensors)}
         terms = [t for t in known.terms if t.sensor in present]
         state = problem.state(terms)
@@ -157,12 +161,6 @@ def _until(session: PoseSession, end: float) -> PoseSession:
     streams = {name: poses.rows(poses.time < end) for name, poses in session.streams.items()}
     reference = streams.pop(REFERENCE, None)
     return replace(session, sensors=streams, reference=reference)
-
-
-def _later_half(problem: PoseProblem) -> PoseProblem:
-    """Return the later half of a window, which a change in its first half has left behind."""
-    ends = np.concatenate([p.time[[0, -1]] for p in problem.sensors])
-    return problem.rows([p.time > 0.5 * (ends.min() + ends.max()) for p in problem.sensors])
 
 
 def _misfits(state: PoseState) -> dict[str, float]:

@@ -198,17 +198,15 @@ def finest_lag(fit: PoseFit) -> PoseFit:
     best = fit
     for factor in LAG_STEPS:
         for direction in (factor, 1 / factor):
-            trial = _slower(best, direction)
+            terms = [
+                t.with_theta(direction * t.theta) if t.role is Role.FILTER else t
+                for t in best.terms
+            ]
+            trial = fit_poses(best.state.problem, terms, 3)
             if trial.state.sum_of_squares < best.state.sum_of_squares:
                 best = trial
                 break
     return with_time_constants(best)
-
-
-def _slower(fit: PoseFit, factor: float) -> PoseFit:
-    """The fit with time constants so many times as long, and all else fitted again."""
-    terms = [t.with_theta(factor * t.theta) if t.role is Role.FILTER else t for t in fit.terms]
-    return fit_poses(fit.state.problem, terms, 3)
 
 
 POSES_A_PARAMETER = 6

@@ -443,7 +443,10 @@ def run(args: argparse.Namespace) -> int:
     """
     seed = int(np.random.default_rng().integers(1, 2**31)) if args.seed is None else args.seed
     effects = [*sorted(CATALOGUE), NONE] if ALL in args.effect else list(args.effect)
-    _check_arguments(args, seed)
+    if not 10.0 <= args.duration <= 600.0:
+        raise ParameterError(f'--duration must be 10 to 600 s, got {args.duration:g}')
+    if seed < 1:
+        raise ParameterError(f'--seed must be at least 1, got {seed}')
     check_packages('recorder')
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     # A ROS system that runs already must neither receive nor be received by what is simulated
@@ -477,13 +480,6 @@ def _run(args: argparse.Namespace, effects: list[str], seed: int) -> int:
         table(rounds, Console(width=None if os.isatty(1) else 200))
         say_written(folder)
     return 0
-
-
-def _check_arguments(args: argparse.Namespace, seed: int) -> None:
-    if not 10.0 <= args.duration <= 600.0:
-        raise ParameterError(f'--duration must be 10 to 600 s, got {args.duration:g}')
-    if seed < 1:
-        raise ParameterError(f'--seed must be at least 1, got {seed}')
 
 
 def _round(

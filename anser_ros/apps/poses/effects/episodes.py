@@ -148,7 +148,8 @@ def _episode(sensing: Sensing, residuals: PoseResiduals, is_beside: bool) -> Epi
         outside = (window >= 0) & ~inside & ~is_off
         # A slow tracker comes near no place again.
         near = _nearest_later(place[inside], window[inside]) if _lasts(runs, count) else NEAR_M
-        is_other = bool(outside.any()) and _is_revisited(place[inside], place[outside], near)
+        distance, _ = cKDTree(place[outside]).query(place[inside])
+        is_other = bool(np.mean(distance < near) > REVISITED_SHARE)
     return Episode(tuple(runs)) if is_other else Episode()
 
 
@@ -211,12 +212,6 @@ def _nearest_later(place: Array, window: Integers) -> Array:
         if len(later):
             out[here] = np.maximum(cKDTree(later).query(place[here])[0], NEAR_M)
     return out
-
-
-def _is_revisited(inside: Array, outside: Array, near: Array | float) -> bool:
-    """Whether most places (n, 3) of an episode are nearer than ``near``, m, to some outside it."""
-    distance, _ = cKDTree(outside).query(inside)
-    return bool(np.mean(distance < near) > REVISITED_SHARE)
 
 
 def _middles(
