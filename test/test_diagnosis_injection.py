@@ -139,6 +139,17 @@ def test_a_moved_emitter_is_one_fault_where_its_gradient_is_hardly_known():
     np.testing.assert_allclose(record.parameters['shift_m'], [-0.003, 0, 0.003], atol=1e-4)
 
 
+def test_a_turn_of_an_emitter_that_nobody_sees_is_no_part_of_its_sigma():
+    effect = all_effects()['coil_turned']
+    term = effect.candidates(world(1, 60, 2).problem().apparatus)[0]  # its moment is along z
+    record = effect.record(term.with_theta([0.01, 0.0, 0.02]), np.diag([1e-6, 4e-6, 9e-4]))
+    sigma = np.degrees([1e-3, 2e-3, 0.0])
+    np.testing.assert_allclose(record.uncertainty['rotation_deg'], sigma, atol=1e-9)
+    np.testing.assert_allclose(
+        record.parameters['rotation_deg'], np.degrees([0.01, 0, 0]), atol=1e-9
+    )
+
+
 @pytest.mark.parametrize('quarter', [0.0, 90.0])
 def test_a_body_and_a_frame_that_stand_elsewhere_are_named_as_such(quarter):
     made, turn = world(1, 375, 3), Rotation.from_rotvec([1.0, quarter, 0.5], degrees=True)

@@ -223,8 +223,7 @@ small unknown (`docs/log.md`)."""
 # Each of the next four lies above all that normal noise reached in 200 draws of 100 frames with 48
 # readings; more frames or readings reach less.
 BOUNDED_VALUES = 4800
-"""Values on which these were chosen: of fewer, noise alone reaches more, by the root of the share.
-"""
+"""Values on which these were chosen: of fewer, noise reaches more, by the share's root."""
 LEAST_CORRELATION = 0.06
 """Correlation (-1 to 1) with a frame before from which residuals have a memory, just above the
 0.053 that normal noise reached. Smaller refuses true noise; larger lets a hum pass for it."""

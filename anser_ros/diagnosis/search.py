@@ -164,7 +164,11 @@ class FluxSelection(ForwardSelection[Fit]):
         """Return the fit without the first effect that the others explain away, but the newest."""
         for index, term in enumerate(fit.terms if len(fit.terms) > 1 else ()):
             fixed = term.effect.family in (Family.REMAINDER, Family.SEEN)
-            if fixed or term is fit.newest or _is_plain(fit, index):
+            if fixed or term is fit.newest:
+                continue
+            # Its parameters may show by themselves that it is needed.
+            size = term.theta.size
+            if size and is_worthwhile(_wald(fit, index) / decisions.CLEAR_GAIN, size, fit):
                 continue
             without = settled(self._fitter, [t for t in fit.terms if t is not term])
             gain = without.held_out() - fit.held_out()
@@ -345,9 +349,3 @@ def _wald(fit: Fit, index: int) -> float:
     use = np.intersect1d(use, term.effect.amounts(term))
     theta, part = term.theta[use], covariance[np.ix_(use, use)]
     return float(theta @ np.linalg.pinv(part, rcond=1e-10, hermitian=True) @ theta)
-
-
-def _is_plain(fit: Fit, index: int) -> bool:
-    """Whether the parameters of a term show by themselves that it is needed."""
-    size = fit.terms[index].theta.size
-    return size > 0 and is_worthwhile(_wald(fit, index) / decisions.CLEAR_GAIN, size, fit)

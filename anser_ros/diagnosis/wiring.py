@@ -91,9 +91,11 @@ def without_dead(problem: Problem) -> Problem:
     return replace(problem, good=tuple(good))
 
 
-def quadrature_left(problem: Problem, known: Sequence[Term]) -> float:
-    """Return the power of imaginary parts, T^2, that predictions leave beside some faults."""
-    return sum(float(_power((t.seen - t.wanted).imag)) for t in _read(problem, known))
+def power_left(problem: Problem, known: Sequence[Term]) -> tuple[float, float]:
+    """Return the share of power that predictions leave of a tool, and of imaginary parts, T^2."""
+    tools = _read(problem, known)
+    quadrature = sum(float(_power((t.seen - t.wanted).imag)) for t in tools)
+    return max(t.left() for t in tools), quadrature
 
 
 def _read(problem: Problem, terms: Sequence[Term]) -> list[_Readings]:

@@ -352,6 +352,7 @@ class CoilTurned(CoilMoved):
         assert isinstance(term, CoilTurnedTerm)
         turn = np.degrees(term.seen @ term.theta).tolist()
         figures = {'rotation_deg': turn, 'centre_m': list(term.centre)}
+        covariance = term.seen @ covariance @ term.seen
         deviation = {'rotation_deg': np.degrees(sigmas(covariance)).tolist()}
         return EffectRecord(self.name, {**term.recorded_site, **figures}, deviation)
 

@@ -49,7 +49,12 @@ def calibrate_at_one_place(
     Raises `FitError` when all fluxes of an emitter are zero.
     """
     posed, emitters = with_pose(measurements), generator.emitters
-    readings, noise_ratio = _mean(posed, accuracy)
+    readings, ratio = _mean(posed, accuracy)
+    noisy = tuple(
+        EffectRecord('excess_noise', {'factor': factor, 'channels': [channel]})
+        for factor, channel in zip(ratio.tolist(), posed.sensors.channel.tolist(), strict=True)
+        if factor > NOISY  # times the median channel's
+    )
     received = readings.flux[readings.used].any(axis=(0, 2))
     if not received.all():
         silent = ', '.join(emitters[k] for k in np.flatnonzero(~received))
@@ -85,7 +90,7 @@ def calibrate_at_one_place(
         damping=0.0,
         n_measurements=int(posed.usable.sum()),
         residuals=Residuals.of(left, flux),
-        scan=Scan((right,), accuracy, effects, _noisy(posed.sensors.channel, noise_ratio)),
+        scan=Scan((right,), accuracy, effects, noisy),
         undetermined=_unclear(posed, fit, readings.used & ~turned) if looked_for else (),
         more={'sources': _places(emitters, fit), 'sensor_widths': dict(fit.widths)},
     )
@@ -188,14 +193,6 @@ def _reversed(channels: Integers, evidence: Array, held_out: Array) -> tuple[Eff
     least, other = float(evidence.min()), float(held_out.min())
     found = {'log_probability': least, 'held_out_log_probability': other}
     return (EffectRecord('sensor_polarity', {'channels': channels.tolist()}, {}, found),)
-
-
-def _noisy(channels: Integers, ratio: Array) -> tuple[EffectRecord, ...]:
-    """A record of each channel with more noise than the median one."""
-    return tuple(
-        EffectRecord('excess_noise', {'factor': float(ratio[k]), 'channels': [int(channels[k])]})
-        for k in np.flatnonzero(ratio > NOISY)
-    )
 
 
 def _unclear(posed: Measurements, fit: SourcesFit, others: Booleans) -> tuple[str, ...]:
