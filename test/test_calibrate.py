@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ from conftest import REPO
 
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.layouts import Layout
+from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.cli import calibrate as command
 from anser_ros.cli.main import main
+from anser_ros.cli.output import loss_notes
 from anser_ros.errors import FitError
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.calibration import calibrate_sessions, check_explained, generator_of
@@ -109,6 +112,20 @@ def test_reference_sensors_take_no_part(factory):
 
 
 # Refusals.
+
+
+def test_a_loss_that_an_error_says_is_not_said_again():
+    lost = (
+        SimpleNamespace(path='a', lost='x is dead?; 2 poses'),
+        SimpleNamespace(path='b', lost=''),
+    )
+    assert loss_notes(*lost, None, said='a: x is dead? mend it') == ('a: 2 poses',)
+
+
+def test_a_session_that_is_given_twice_is_refused(capsys, tmp_path):
+    assert f'{FACTORY} is given twice' in refusal(
+        capsys, FACTORY, FACTORY, '--out', tmp_path / 'm.yaml'
+    )
 
 
 def refusal(capsys, *arguments):
@@ -238,6 +255,16 @@ def test_a_reversed_sensor_of_a_scan_is_used_and_what_no_field_explains_refused(
     channels = tool.sensors.channel[1:2].tolist()
     assert (record.name, record.parameters) == ('sensor_polarity', {'channels': channels})
     assert found.residuals.rmse_t == pytest.approx(right.residuals.rmse_t)
+    name = tool.sensors.name[1]
+    assert [f'sensor {name} is reversed' in w for w in found.contradictions] == [True]
+    other = replace(wrong, path='other.mcap')
+    with pytest.raises(FitError, match=f'^other.mcap: sensor {name} is reversed, beside the'):
+        calibrate_sessions([factory, replace(factory, path='again'), other], options)
+    unread = np.where(np.arange(len(tool.sensors))[:, None] == 1, 1e-11, tool.flux)
+    calibrate_sessions([replace(factory, tools=(replace(tool, flux=unread),))], options)
+    exact = factory.with_stated({'optical_position_m': 1e-6})
+    doubts = calibrate_sessions([exact], replace(options, estimate=KINDS)).contradictions
+    assert [w for w in doubts if 'some stand elsewhere than they say' in w]
     check_explained(right)
     apart = replace(right.held_out, error=right.held_out.error + 0.1 * right.residuals.read_t)
     with pytest.raises(FitError, match=r'10 % of the signal is left.*sessions of its own'):

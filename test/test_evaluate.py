@@ -194,7 +194,12 @@ def test_exchanged_emitters_are_named_where_no_pose_is_given(model):
     known, session = load_model(model), load_session(BAGS / 'moving.mcap')
     tool = session.tools[0].frames(np.arange(0, len(session.tools[0].time), 5))
     order = [0, 2, 1, *range(3, 8)]
-    for flux, words in ((tool.flux[:, :, order], 'swapped_coils'), (1.5 * tool.flux, 'any other')):
+    gains = np.linspace(0.8, 1.2, tool.flux.shape[1])[:, None]
+    for flux, words in (
+        (tool.flux[:, :, order], 'swapped_coils'),
+        (1.5 * tool.flux, 'fluxes are 1.5 times what the model makes at their poses'),
+        (gains * tool.flux, 'any other'),
+    ):
         wrong = replace(session, tools=(replace(tool, flux=flux),), reference=None)
         (said,) = figures.why_withheld(known, track_session(wrong, known), wrong)
         assert 'state residual' in said and words in said

@@ -76,6 +76,9 @@ def test_what_is_right_passes_unchanged(moving, tool):
         f'fluxes of {tool.body} are missing or not finite in 1 of {len(flux)} frames'
     )
     assert words in checked(moving, replace(tool, flux=flux))[1]
+    assert checked(moving, tool, {'tool/flux: twice': 7})[1] == '7 of tool/flux: twice'
+    faint = np.where(np.arange(len(tool.sensors))[:, None] == 2, 1e-11, tool.flux)
+    assert 'no reading of' in checked(moving, replace(tool, flux=faint))[1]
     half = tool.flux.copy()
     half[len(half) // 2 :, :, 1] = 0.0
     half[:9] = np.nan  # missing readings are no silence

@@ -8,7 +8,13 @@ from diagnosis_world import world
 from scipy.spatial.transform import Rotation
 
 from anser_ros.diagnosis.problem import evaluate
-from anser_ros.diagnosis.wiring import rightly_wired, scan_faults, wiring_faults, without_dead
+from anser_ros.diagnosis.wiring import (
+    rightly_wired,
+    scan_faults,
+    wiring_faults,
+    wiring_words,
+    without_dead,
+)
 from anser_ros.effects.effect import Term, effect_named
 from anser_ros.physics.pose_track import PoseTrack
 
@@ -140,10 +146,37 @@ def test_a_scan_says_what_is_wrong_with_its_wiring(fault, expected):
         flux[:, [1, 3]] = flux[:, [3, 1]]
     tool = replace(made.tool, flux=flux)
     line = np.linspace(-0.12, 0.12, 5)
-    found = scan_faults([tool], np.array([(x, y, 0.0) for x in line for y in line]))
-    assert [(term.effect.name, said(term)) for term in found] == expected
+    found, own = scan_faults([[tool]], np.array([(x, y, 0.0) for x in line for y in line]))
+    assert not own and [(term.effect.name, said(term)) for term in found] == expected
     righted = rightly_wired(tool, found)
     if fault != 'coil':
         np.testing.assert_allclose(righted.flux, clean)
     if fault == 'turn':
         np.testing.assert_allclose(righted.sensors.axis[0], [0.0, 1.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('fault', 'words'),
+    [
+        ('turn', 'tool stands turned by 90 deg about +z against its stated axes'),
+        ('sign', 'sensor tool/0/y and sensor tool/1/y are reversed'),
+        ('coils', 'emitter 0 and emitter 2 are reversed'),
+    ],
+)  # fmt: skip
+def test_a_session_that_stands_otherwise_is_named(fault, words):
+    made = world(seed=2, frames=300, emitters=3)
+    plain = made.tool
+    if fault == 'turn':
+        turned_back(made, TURN)
+    flux = made.tool.flux.copy()
+    if fault == 'sign':
+        flux[:, [1, 4]] *= -1.0
+    if fault == 'coils':
+        flux[:, :, [0, 2]] *= -1.0
+    wrong = replace(made.tool, flux=flux)
+    line = np.linspace(-0.12, 0.12, 5)
+    places = np.array([(x, y, 0.0) for x in line for y in line])
+    parts = [[m.frames(slice(k, None, 3))] for k, m in enumerate((plain, wrong, plain))]
+    common, own = scan_faults(parts, places)
+    assert not common and [number for number, _ in own] == [1]
+    assert wiring_words(own[0][1], plain.sensors, '012') == words

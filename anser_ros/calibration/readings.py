@@ -241,7 +241,10 @@ def check_measurements(
     got, need, widest = _thickness(measurements)
     if got < need:
         if widest < need:
-            raise FitError(f'all readings lie within {1e3 * widest:.2g} mm rms: are places in m?')
+            raise FitError(
+                f'all readings lie within {1e3 * widest:.2g} mm rms: are places in m? '
+                'A scan needs poses all over the volume'
+            )
         raise FitError(
             f'all readings lie in one plane: their spread across it must be at least '
             f'{1e3 * need:.2f} mm rms, got {1e3 * got:.2f} mm'

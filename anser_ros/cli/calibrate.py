@@ -15,6 +15,7 @@ from anser_ros.calibration.result import Calibration, to_document
 from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.cli import output
 from anser_ros.cli.diagnosis_words import flux_unit, short_ones, value_text
+from anser_ros.cli.sessions import names_of
 from anser_ros.effects.effect import effect_named
 from anser_ros.errors import FitError
 from anser_ros.field.model import EffectRecord
@@ -72,6 +73,7 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     Raises `FitError` when the nominal model is better, and that is not forced.
     """
     stated = output.stated_values(args)
+    names_of(args.sessions)
     options = Options(layout=args.dipoles, estimate=args.estimate)
     sessions = [load_session(path).with_stated(stated) for path in args.sessions]
     check_same_board(sessions)
@@ -81,6 +83,7 @@ def work(args: argparse.Namespace, tell: output.Tell) -> output.Result:
     try:
         calibration = calibrate_sessions(sessions, options, tell)
     except FitError as error:
+        lost = output.loss_notes(*sessions, said=str(error))
         raise FitError('; '.join((str(error), *lost))) from error
     document = to_document(calibration)
     if args.report is not None:

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from anser_ros.cli import output, sessions
 from anser_ros.cli import page as html
 from anser_ros.diagnosis.diagnose import WIRING_FRAMES
-from anser_ros.diagnosis.wiring import wiring_faults
+from anser_ros.diagnosis.wiring import common_gain, wiring_faults
 from anser_ros.errors import DiagnosisError, ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.fingerprint import fingerprint_of
@@ -295,13 +295,19 @@ def _few_notes(session: Session) -> tuple[str, ...]:
     )
 
 
-def _wired(session: Session, model: FieldModel) -> str:
-    """What is wired otherwise than a model says, as `diagnose` names it; empty without poses."""
+def _read_as(session: Session, model: FieldModel) -> str:
+    """What fluxes read like at their poses: wired otherwise than a model says, as `diagnose` names
+    it, or all that many times as large; empty without poses.
+    """
     try:
         problem = problem_of(correct(prepare(session, model))).thinned(WIRING_FRAMES)
     except DiagnosisError:
         return ''
-    return ', '.join(term.label for term in wiring_faults(problem))
+    if wired := ', '.join(term.label for term in wiring_faults(problem)):
+        return f'they read like {wired}; anser diagnose writes a model with that'
+    gain = common_gain(problem)
+    made = f'fluxes are {gain or 1.0:.4g} times what the model makes at their poses'
+    return f'{made}: another coil, other currents, or another unit?' if gain else ''
 
 
 def why_withheld(model: FieldModel, evaluation: Evaluation, session: Session) -> tuple[str, ...]:
@@ -321,8 +327,8 @@ def why_withheld(model: FieldModel, evaluation: Evaluation, session: Session) ->
     words = f'{whose} withheld, state {worst} in {count} of {len(poses)}{such}'
     if worst != RESIDUAL:
         return (words,)
-    if wired := _wired(session, model):
-        return (f'{words}: they read like {wired}; anser diagnose writes a model with that',)
+    if read_as := _read_as(session, model):
+        return (f'{words}: {read_as}',)
     listed = f'the coils of its calibration (channels {", ".join(map(str, known))})'
     return (
         f'{words}: the model knows {listed if known else "no coil by itself"}; any other, 2 % '

@@ -287,6 +287,8 @@ def terminal_table(head: Sequence[str], rows: Iterable[Sequence[str]], **style: 
     return shown
 
 
-def loss_notes(*sessions: Any) -> tuple[str, ...]:
-    """State what recordings have lost, where they have; None is left out."""
-    return tuple(f'{one.path}: {one.lost}' for one in sessions if one is not None and one.lost)
+def loss_notes(*sessions: Any, said: str = '') -> tuple[str, ...]:
+    """State what recordings have lost, where they have; None is left out, and what was said."""
+    told = ((one.path, one.lost.split('; ')) for one in sessions if one is not None and one.lost)
+    new = ((path, '; '.join(w for w in words if w not in said)) for path, words in told)
+    return tuple(f'{path}: {words}' for path, words in new if words)

@@ -28,7 +28,7 @@ from anser_ros.calibration.result import Calibration, Scan, at_start, drift_reco
 from anser_ros.calibration.sensor_parameters import EXTRA_KINDS, KINDS
 from anser_ros.diagnosis.departure import KNOWN, Departure, departure
 from anser_ros.diagnosis.problem import Problem, Spread, build_problem
-from anser_ros.diagnosis.wiring import rightly_wired, scan_faults
+from anser_ros.diagnosis.wiring import ScanFaults, rightly_wired, scan_faults, wiring_words
 from anser_ros.effects.correction import tool_view
 from anser_ros.effects.effect import Remedy, Term, effect_named
 from anser_ros.errors import DiagnosisError, FitError
@@ -38,7 +38,7 @@ from anser_ros.field.nominal import nominal_model
 from anser_ros.sessions.baseline import readings_of
 from anser_ros.sessions.drawn_calibration import fit_to_drawing, is_for_drawing
 from anser_ros.sessions.nominal_board import NominalBoard, board_of
-from anser_ros.sessions.plausibility import FLUX_UNITS, TOO_LARGE, silent, unit_words
+from anser_ros.sessions.plausibility import FLUX_UNITS, TOO_LARGE, silent, unit_words, unread
 from anser_ros.sessions.session import Session, shifted
 from anser_ros.sessions.starting_model import made_for
 from anser_ros.settings import Accuracy
@@ -59,6 +59,10 @@ and more."""
 SIGMAS = 3.0 * math.sqrt(2.0)
 """Stated errors of poses that a contradiction between parts of a scan has to exceed: both have
 theirs."""
+JITTER = 30.0
+"""Errors of the poses, in those that are stated, from which on they are no jitter. What the model
+cannot explain counts as theirs, which makes up to four of a good scan; poses in a frame that is a
+quarter turn off made a hundred."""
 UNCERTAINTY_FRAMES = 60
 """Frames of a tool, about, in which the uncertainty of the metal at rest is worked out."""
 
@@ -279,18 +283,21 @@ def _fit_as_scan(
 ) -> Calibration:
     """Fit on all tool sensors of the sessions, and once more without metal that rested nearby."""
     sessions, drifts = at_constant_strength(sessions, options)
-    measurements = [tool for session in sessions for tool in session.tools]
-    check_single_coils(measurements)
+    tools = [
+        [_with_readings(session.setup, tool) for tool in session.tools] for session in sessions
+    ]
+    check_single_coils(measurements := [tool for own in tools for tool in own])
     setup = sessions[0].setup
     generator = replace(generator_of(setup), nominal=NominalBoard.of(setup).model)
     around = ASIDE * generator.side_m * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     places = (generator.centres[:, None] + around).reshape(-1, 3)
-    wrong = scan_faults([with_pose(m) for m in measurements], places)
-    measurements = [rightly_wired(m, wrong) for m in measurements]
+    wrong = scan_faults([[with_pose(m) for m in own] for own in tools if own], places)
+    _check_alike([s for s in sessions if s.tools], wrong)
+    measurements = [rightly_wired(m, wrong.common) for m in measurements]
     names = [Path(session.path).name for session in sessions for _ in session.tools]
     steady = [_steady(session, tool) for session in sessions for tool in session.tools]
     scan = correct_scan(measurements, generator, options, progress, steady)
-    scan = _with_faults(scan, wrong)
+    scan = _with_faults(scan, wrong.common)
     calibration = fit_scan(scan, names, generator, options, progress)
     bare = without_resting_metal(sessions, calibration, progress)
     if bare is not None:
@@ -302,7 +309,33 @@ def _fit_as_scan(
     scan = calibration.scan
     scan = replace(scan, reported_effects=(*scan.reported_effects, *drifts))
     model = at_start(calibration.model) if drifts else calibration.model
-    return replace(calibration, model=model, scan=scan)
+    words = [
+        f'{wiring_words(term, sessions[0].sensors, setup.emitter_names)}, says the scan itself, '
+        'and the model corrects it: mend the wiring, or what is stated'
+        for term in wrong.common
+    ]
+    doubts = (*calibration.contradictions, *words)
+    return replace(calibration, model=model, scan=scan, contradictions=doubts)
+
+
+def _with_readings(setup: Setup, tool: Measurements) -> Measurements:
+    """The tool without what sensors say that read nothing."""
+    return replace(tool, valid=tool.valid & ~unread(setup, tool))
+
+
+def _check_alike(sessions: Sessions, wrong: ScanFaults) -> None:
+    """Raise `FitError` where some sessions are wired or mounted otherwise than the others."""
+    told = dict[str, list[str]]()
+    for number, term in wrong.own:
+        one = sessions[number]
+        words = wiring_words(term, one.sensors, one.setup.emitter_names)
+        told.setdefault(one.path, []).append(words)
+    if told:
+        each = '; '.join(f'{path}: {", ".join(words)}' for path, words in told.items())
+        raise FitError(
+            f'{each}, beside the other sessions: mend the poses or the axes that are stated '
+            'there, or the wiring, or leave it out'
+        )
 
 
 def _with_faults(scan: Scan, faults: Sequence[Term]) -> Scan:
@@ -443,12 +476,24 @@ def calibrate_sessions(
 
 
 def _noise_words(calibration: Calibration, setup: Setup) -> list[str]:
-    """Words where the noise, all that says in T how large fluxes are, is not what is stated."""
+    """Words where the noise, all that says in T how large fluxes are, is not what is stated, and
+    where the poses jitter by what no tracker does.
+    """
+    words = list[str]()
     stated, least = setup.stated.get('flux_noise_t', 0.0), calibration.held_out.flux_noise_t
     found = max(least, min(calibration.fit.noise_t, stated))  # errors of poses are in the latter
     ratio = found / stated if stated else 1.0
-    words = (
-        f'fluxes: noise of {found:.2g} T is found, {ratio:.3g} times the stated flux_noise_t: '
-        f'{unit_words(ratio, FLUX_UNITS) or "another unit than T"}, or is that stated wrongly?'
-    )
-    return [] if 1.0 / TOO_LARGE < ratio < TOO_LARGE else [words]
+    if not 1.0 / TOO_LARGE < ratio < TOO_LARGE:
+        unit = unit_words(ratio, FLUX_UNITS) or 'another unit than T'
+        words.append(
+            f'fluxes: noise of {found:.2g} T is found, {ratio:.3g} times the stated '
+            f'flux_noise_t: {unit}, or is that stated wrongly?'
+        )
+    fit, most_m = calibration.scan.sensor_fit, setup.accuracy.optical_position_m
+    if fit is not None and fit.optical.position_m > JITTER * most_m:
+        words.append(
+            f'poses: errors of {1e3 * fit.optical.position_m:.2g} mm are found, where '
+            f'{1e3 * most_m:.2g} are stated: some stand elsewhere than they say, by a frame or '
+            'fixture, or something moved'
+        )
+    return words

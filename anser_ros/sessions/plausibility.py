@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from anser_ros.arrays import Array, Integers
+from anser_ros.arrays import Array, Booleans, Integers
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
@@ -276,8 +276,9 @@ def plausible_tools(
         raise PlausibilityError(f'{path}: all fluxes of all tools are {what}')
     dead = silent(setup, tools).items()
     words += [f'{name} gives nothing but noise{often}: is it dead?' for name, often in dead]
+    words += [f'{n} of {what}' for what, n in refused.items() if not optical_stem(what)]
     for tool in tools:
-        words += [*_check_refused(path, tool, refused), *_missing(tool)]
+        words += [*_check_refused(path, tool, refused), *_missing(setup, tool)]
         _check_clocks(path, tool)
         thawed, remarks = _thawed(path, tool)
         words += remarks
@@ -310,10 +311,16 @@ def silent(setup: Setup, tools: Sequence[Measurements]) -> dict[str, str]:
     }
 
 
-def _missing(tool: Measurements) -> list[str]:
+def unread(setup: Setup, tool: Measurements) -> Booleans:
+    """Return which of a tool's sensors (S,) read no more than noise while others give more."""
+    power = np.sum(np.where(np.isfinite(tool.flux), np.abs(tool.flux), 0.0) ** 2, axis=(0, 2))
+    size = np.sqrt(power / max(1, tool.flux[:, 0].size))
+    return np.asarray(size <= min(SILENT * setup.accuracy.flux_noise_t, WEAK * size.max()))
+
+
+def _missing(setup: Setup, tool: Measurements) -> list[str]:
     """Words for sensors without any reading, and for frames that lack those of others."""
-    read = np.isfinite(tool.flux)
-    dead = np.asarray(~np.nan_to_num(tool.flux).any(axis=(0, 2)))
+    read, dead = np.isfinite(tool.flux), unread(setup, tool)
     rest = read[:, ~dead][:, :, read.any(axis=(0, 1))]
     lacking = int((~rest.all(axis=(1, 2))).sum())
     names = ', '.join(name for name, gone in zip(tool.sensors.name, dead, strict=True) if gone)

@@ -156,7 +156,11 @@ class _Collector:
     def flux_stream(self, which: str) -> recorded.RecordedFluxes | None:
         frames: dict[int, FluxPoints] = {}
         n_emitters = Counter(points.flux.shape[1] for _, points in self.flux[which])
+        last = 0
         for stamp, points in self.flux[which]:
+            if stamp < last:
+                self.refused[f'{which}/flux: stamped before the one ahead of it, and sorted'] += 1
+            last = stamp
             if points.flux.shape[1] != n_emitters.most_common(1)[0][0]:
                 self.refused[f'{which}/flux: another number of emitters'] += 1
             elif stamp in frames:
