@@ -11,6 +11,7 @@ from anser_ros.diagnosis.problem import evaluate
 from anser_ros.diagnosis.wiring import (
     rightly_wired,
     scan_faults,
+    session_faults,
     wiring_faults,
     wiring_words,
     without_dead,
@@ -146,8 +147,8 @@ def test_a_scan_says_what_is_wrong_with_its_wiring(fault, expected):
         flux[:, [1, 3]] = flux[:, [3, 1]]
     tool = replace(made.tool, flux=flux)
     line = np.linspace(-0.12, 0.12, 5)
-    found, own = scan_faults([[tool]], np.array([(x, y, 0.0) for x in line for y in line]))
-    assert not own and [(term.effect.name, said(term)) for term in found] == expected
+    found = scan_faults([tool], np.array([(x, y, 0.0) for x in line for y in line]))
+    assert [(term.effect.name, said(term)) for term in found] == expected
     righted = rightly_wired(tool, found)
     if fault != 'coil':
         np.testing.assert_allclose(righted.flux, clean)
@@ -176,7 +177,7 @@ def test_a_session_that_stands_otherwise_is_named(fault, words):
     wrong = replace(made.tool, flux=flux)
     line = np.linspace(-0.12, 0.12, 5)
     places = np.array([(x, y, 0.0) for x in line for y in line])
-    parts = [[m.frames(slice(k, None, 3))] for k, m in enumerate((plain, wrong, plain))]
-    common, own = scan_faults(parts, places)
-    assert not common and [number for number, _ in own] == [1]
-    assert wiring_words(own[0][1], plain.sensors, '012') == words
+    parts = [m.frames(slice(k, None, 3)) for k, m in enumerate((plain, wrong, plain))]
+    number, (term,) = session_faults([[part] for part in parts], places)
+    assert (number, wiring_words(term, plain.sensors, '012')) == (1, words)
+    assert session_faults([[plain.frames(slice(k, None, 3))] for k in range(3)], places)[1] == []

@@ -27,6 +27,7 @@ from anser_ros.effects.seen import (
 )
 from anser_ros.effects.sensors import BODY_TURNED
 from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import Dipoles
 from anser_ros.physics.constants import DEGREES
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import SensorTable, along_each_axis
@@ -71,17 +72,30 @@ def _silent(seen: ComplexArray, wanted: ComplexArray, axes: tuple[int, ...] = (0
     return np.asarray((power < decisions.DEAD**2 * expected) & (expected > 0))
 
 
+class _Told(NamedTuple):
+    """Holds tools, which of their readings count, and what predicts them, as a problem does."""
+
+    tools: Sequence[Measurements]
+    good: Sequence[Booleans]
+    fields: Fields
+
+
 def wiring_faults(problem: Problem) -> list[Term]:
     """Return terms for the faults of wiring and mounting of the tools and emitters."""
+    found, dead = _tool_faults(problem)
+    if dead := dead + _silent_references(problem):
+        found.append(Term(DEAD_CHANNEL, {'channels': tuple(dead)}))
+    return found
+
+
+def _tool_faults(problem: Problem | _Told) -> tuple[list[Term], list[int]]:
+    """The faults of tools and emitters, and the channels of tools that receive nothing."""
     found = _swapped_coils(_read(problem, ()))
     for number in range(len(problem.tools)):
         found += _rewired(problem, number, found)
     tools = _read(problem, found)
     dead = [int(c) for tool in tools for c in tool.channels[~tool.driven]]
-    found += _reversed(tools)
-    if dead := dead + _silent_references(problem):
-        found.append(Term(DEAD_CHANNEL, {'channels': tuple(dead)}))
-    return found
+    return found + _reversed(tools), dead
 
 
 def without_dead(problem: Problem) -> Problem:
@@ -110,7 +124,7 @@ def common_gain(problem: Problem) -> float | None:
     return float(np.abs(gain)) if left**2 < decisions.BETTER * plain**2 else None
 
 
-def _read(problem: Problem, terms: Sequence[Term]) -> list[_Readings]:
+def _read(problem: Problem | _Told, terms: Sequence[Term]) -> list[_Readings]:
     pairs = zip(problem.tools, problem.good, strict=True)
     return [_Readings.of(tool, good, terms, problem.fields) for tool, good in pairs]
 
@@ -125,7 +139,7 @@ def _silent_references(problem: Problem) -> list[int]:
     return [int(c) for c in readings.sensors.channel[silent]]
 
 
-def _rewired(problem: Problem, number: int, known: Sequence[Term]) -> list[Term]:
+def _rewired(problem: Problem | _Told, number: int, known: Sequence[Term]) -> list[Term]:
     """Exchanged channels of a tool, or its quarter turn, whichever leaves less or says less.
 
     A turn of a triaxial sensor is also an exchange of its coils, some of them reversed. What is
@@ -166,51 +180,60 @@ MOST_LEFT = 0.02
 hundredth for coils of some centimetres, a third where one sensor of three is reversed."""
 
 
-class ScanFaults(NamedTuple):
-    """Holds what is wired or mounted wrongly: in all sessions of a scan, or in some alone."""
+def scan_faults(measurements: Sequence[Measurements], places: Array) -> list[Term]:
+    """Return what is reversed or turned in a scan, whose field is still unknown.
 
-    common: list[Term]
-    own: list[tuple[int, Term]]  # with the number of the session
-
-
-class _Seen(NamedTuple):
-    """Holds what C free dipoles can tell of a session's readings."""
-
-    normal: Array  # (C, C)
-    right: dict[int, ComplexArray]  # of each channel, (C, K)
-    power: Array  # (K,), of the readings
-
-
-def scan_faults(sessions: Sequence[Sequence[Measurements]], places: Array) -> ScanFaults:
-    """Return what is reversed, exchanged or turned in a scan, whose field is still unknown.
-
-    ``sessions``: measurements with poses; ``places`` (P, 3): about where the emitters are, m. Each
-    emitter is three free dipoles at every place. Signs of emitters are signs of their dipoles, but
-    where sessions differ, and nothing is named unless it leaves a small part of what is left
-    without it.
+    ``measurements``: with poses; ``places`` (P, 3): about where the emitters are, m. Each emitter
+    is three free dipoles at every place. Signs of emitters are signs of their dipoles, and nothing
+    is named unless it leaves a small part of what is left without it.
     """
-    plain = [_seen(session, places) for session in sessions]
-    if not any(one.power.any() for one in plain):
-        return ScanFaults([], [])
-    first, left, none = _scan_signs(plain)
-    if none < MOST_LEFT:
-        return ScanFaults([], [])
-    tried = [(first, left)]
-    for channels in {tuple(m.sensors.channel.tolist()): None for s in sessions for m in s}:
+    read = [m for m in measurements if m.usable.any()]
+    none = _scan_signs(read, places) if read else ([], 0.0, 0.0)
+    if none[2] < MOST_LEFT:
+        return []
+    tried = [none]
+    for channels in {tuple(m.sensors.channel.tolist()): None for m in read}:
         for term in (*_exchanges(channels), *_quarter_turns(np.array(channels))):
-            righted = [_seen([rightly_wired(m, [term]) for m in s], places) for s in sessions]
-            faults, left, _ = _scan_signs(righted)
-            tried.append((ScanFaults([term, *faults.common], faults.own), left))
-            for number in range(len(sessions)) if len(sessions) > 1 else ():
-                parts = [*plain[:number], righted[number], *plain[number + 1 :]]
-                faults, left, _ = _scan_signs(parts)
-                own = [(number, term), *faults.own]
-                tried.append((ScanFaults(faults.common, own), left))
-    least = min(left for _, left in tried)
-    if least > decisions.BETTER * none:
-        return ScanFaults([], [])
-    alike = [way for way, left in tried if left <= decisions.AS_LITTLE * least]
-    return min(alike, key=lambda way: len(way.common) + len(way.own))
+            righted = [rightly_wired(m, [term]) for m in read]
+            terms, left, _ = _scan_signs(righted, places)
+            tried.append(([term, *terms], left, none[2]))
+    least = min(left for _, left, _ in tried)
+    if least > decisions.BETTER * none[2]:
+        return []
+    alike = [way for way in tried if way[1] <= decisions.AS_LITTLE * least]
+    return min(alike, key=lambda way: len(way[0]))[0]
+
+
+def session_faults(
+    sessions: Sequence[Sequence[Measurements]], places: Array
+) -> tuple[int, list[Term]]:
+    """Return which session alone is wired or mounted otherwise than the others of a scan, and how.
+
+    Free dipoles at the places, as in `scan_faults`, that explain the others predict its readings.
+    Without such a session there are no faults; of two that only differ, it is the shorter.
+    """
+    found = list[tuple[int, int, list[Term]]]()
+    for number, own in enumerate(sessions):
+        others = [m for k, one in enumerate(sessions) if k != number for m in one]
+        dipoles, left = _free_dipoles(others, places)
+        if left > MOST_LEFT:
+            continue
+        omega = np.zeros(dipoles.moments.shape[1])
+        told = _Told(own, [m.usable for m in own], Fields(dipoles, dipoles, omega))
+        terms, _ = _tool_faults(told)
+        after, before = (max(r.left() for r in _read(told, some)) for some in (terms, ()))
+        if after < min(1 - decisions.OTHERS_CORRELATION**2, decisions.BETTER * before):
+            found.append((sum(m.time.size for m in own), number, terms))
+    return min(found, key=lambda one: (len(one[2]), one[0]))[1:] if found else (0, [])
+
+
+def _free_dipoles(measurements: Sequence[Measurements], places: Array) -> tuple[Dipoles, float]:
+    """The free dipoles at places that explain measurements, and the share of power they leave."""
+    normal, right, power = _sums(measurements, places)
+    together = np.sum(list(right.values()), axis=0)
+    moments = np.linalg.solve(normal, together)
+    explained = np.sum(together.conj() * moments, axis=0).real / np.maximum(power, 1e-300)
+    return Dipoles(*along_each_axis(places), moments), 1.0 - float(np.mean(explained))
 
 
 def wiring_words(term: Term, sensors: SensorTable, emitters: Sequence[str]) -> str:
@@ -246,12 +269,17 @@ def _exchanges(channels: Sequence[int]) -> list[Term]:
     return [Term(SWAPPED_CHANNELS, site) for site in sites]
 
 
-def _seen(session: Sequence[Measurements], places: Array) -> _Seen:
+def _sums(
+    measurements: Sequence[Measurements], places: Array
+) -> tuple[Array, dict[int, ComplexArray], Array]:
+    """The damped normal matrix (3 P, 3 P) of free dipoles at places (P, 3), its right side for
+    each channel, (3 P, K), and the power (K,) of the readings.
+    """
     positions, directions = along_each_axis(places)
-    count, emitters = len(positions), session[0].flux.shape[2]
-    normal, power = np.zeros((count, count)), np.zeros(emitters)
+    count = 3 * len(places)
+    normal, power = np.zeros((count, count)), np.zeros(measurements[0].flux.shape[2])
     right: dict[int, ComplexArray] = {}
-    for m in session:
+    for m in measurements:
         points, axes = m.placed()
         for row, channel in enumerate(m.sensors.channel.tolist()):
             keep = m.usable[:, row]
@@ -260,79 +288,29 @@ def _seen(session: Sequence[Measurements], places: Array) -> _Seen:
             normal += basis.T @ basis
             right[channel] = right.get(channel, 0.0) + basis.T @ flux
             power += np.sum(np.abs(flux) ** 2, axis=0)
-    return _Seen(normal, right, power)
+    return normal + RIDGE * float(np.trace(normal)) / count * np.eye(count), right, power
 
 
-def _scan_signs(sessions: Sequence[_Seen]) -> tuple[ScanFaults, float, float]:
+def _scan_signs(
+    measurements: Sequence[Measurements], places: Array
+) -> tuple[list[Term], float, float]:
     """The sensors that are reversed, and the shares of power left with and without their signs.
 
-    With signs q of the sensors of all sessions the dipoles explain q M q, where M is a sum over
-    the emitters; of these, those between two sessions have the emitter's signs there besides.
+    With signs q of the sensors the dipoles explain q M q, where M is a sum over the emitters.
     """
-    normal = np.sum([s.normal for s in sessions], axis=0)
-    share = 1.0 / np.maximum(np.sum([s.power for s in sessions], axis=0), 1e-300)
-    owner = np.array([number for number, s in enumerate(sessions) for _ in s.right])
-    channels = np.array([channel for s in sessions for channel in s.right])
-    sums = np.array([one for s in sessions for one in s.right.values()])  # (R, C, K)
-    ridge = RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
-    solved = np.linalg.solve(normal + ridge, sums)
-    each = np.einsum('sck,tck,k->kst', sums.conj(), solved, share / len(share)).real
-    left, plain = np.inf, 1.0 - float(each.sum())
-    for start in (np.ones((len(share), len(sessions))), _aligned(each, owner, len(sessions))):
-        signed = (each * start[:, owner, None] * start[:, None, owner]).sum(axis=0)
-        signs = _best_signs(signed)
-        if 1.0 - signs @ signed @ signs < left:
-            left, q, coils = 1.0 - float(signs @ signed @ signs), signs, start
-    power = np.array([s.power.sum() for s in sessions])
-    q, coils = _fewest(q, coils, owner, 1.0 + power / (len(power) * power.sum()))
-    common = [c for c in dict.fromkeys(channels.tolist()) if (q[channels == c] < 0).all()]
-    found = ScanFaults([Term(SENSOR_POLARITY, {'channels': tuple(common)})] * bool(common), [])
-    for number in range(len(sessions)):
-        if own := channels[(owner == number) & (q < 0) & ~np.isin(channels, common)].tolist():
-            found.own.append((number, Term(SENSOR_POLARITY, {'channels': tuple(own)})))
-        if of_coils := np.flatnonzero(coils[:, number] < 0).tolist():
-            found.own.append((number, Term(COIL_POLARITY, {'coils': tuple(of_coils)})))
-    if left > decisions.BETTER * plain or not (found.common or found.own):
-        return ScanFaults([], []), plain, plain
-    return found, left, plain
-
-
-def _aligned(each: Array, owner: Integers, count: int) -> Array:
-    """Signs (K, S) of emitters in sessions, each as it reads beside those before."""
-    coils, q = np.ones((len(each), count)), np.zeros(len(owner))
-    for number in range(count):
-        own = owner == number
-        beside = np.einsum('kst,kt,t->ks', each[:, own], coils[:, owner], q)
-        if beside.any():
-            left, _, right = np.linalg.svd(np.sign(beside), full_matrices=False)
-            q[own], coils[:, number] = (np.where(v < 0, -1, 1) for v in (right[0], left[:, 0]))
-        else:
-            q[own] = _best_signs(each[:, own][:, :, own].sum(axis=0))
-    return coils
-
-
-def _fewest(sensors: Array, coils: Array, owner: Integers, weight: Array) -> tuple[Array, Array]:
-    """Signs of sensors (R,) and of emitters (K, S) that say the same with the fewest reversed.
-
-    All of a session's may be turned round, and an emitter's in all sessions, of which those with
-    more weight (S,) have it right.
-    """
-    for of_coils in (False, True):
-        turned = np.array([
-            sensors[owner == number].sum() + of_coils * own.sum() < 0
-            for number, own in enumerate(coils.T)
-        ])  # fmt: skip
-        sensors = np.where(turned[owner], -sensors, sensors)
-        coils = np.where(turned, -coils, coils)
-        coils = np.where((coils @ weight < 0)[:, None], -coils, coils)
-    return sensors, coils
-
-
-def _best_signs(together: Array) -> Array:
-    """Signs q that make q M q large."""
+    normal, right, power = _sums(measurements, places)
+    sums = np.array(list(right.values()))  # (S, 3 P, K)
+    solved = np.linalg.solve(normal, sums)
+    share = 1.0 / np.maximum(power, 1e-300)
+    together = np.einsum('sck,tck,k->st', sums.conj(), solved, share).real / len(share)
     starts = np.concatenate([np.ones((1, len(together))), np.linalg.eigh(together)[1].T, together])
-    climbed = (_climbed(start, together) for start in starts)
-    return max(climbed, key=lambda q: float(q @ together @ q))
+    signs = max((_climbed(q, together) for q in starts), key=lambda q: float(q @ together @ q))
+    signs = -signs if (signs < 0).sum() > (signs > 0).sum() else signs
+    left, plain = (1.0 - float(q @ together @ q) for q in (signs, np.ones(len(signs))))
+    reversed_ = tuple(c for c, sign in zip(right, signs, strict=True) if sign < 0)
+    if not reversed_ or left > decisions.BETTER * plain:
+        return [], plain, plain
+    return [Term(SENSOR_POLARITY, {'channels': reversed_})], left, plain
 
 
 def _climbed(start: Array, together: Array) -> Array:

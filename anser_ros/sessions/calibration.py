@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from anser_ros import extensions
-from anser_ros.arrays import Booleans, ComplexArray
+from anser_ros.arrays import Array, Booleans, ComplexArray
 from anser_ros.calibration import disturbances
 from anser_ros.calibration.calibrate import Options, correct_scan, fit_scan
 from anser_ros.calibration.drawn_fit import FINE
@@ -28,7 +28,7 @@ from anser_ros.calibration.result import Calibration, Scan, at_start, drift_reco
 from anser_ros.calibration.sensor_parameters import EXTRA_KINDS, KINDS
 from anser_ros.diagnosis.departure import KNOWN, Departure, departure
 from anser_ros.diagnosis.problem import Problem, Spread, build_problem
-from anser_ros.diagnosis.wiring import ScanFaults, rightly_wired, scan_faults, wiring_words
+from anser_ros.diagnosis.wiring import rightly_wired, scan_faults, session_faults, wiring_words
 from anser_ros.effects.correction import tool_view
 from anser_ros.effects.effect import Remedy, Term, effect_named
 from anser_ros.errors import DiagnosisError, FitError
@@ -291,13 +291,14 @@ def _fit_as_scan(
     generator = replace(generator_of(setup), nominal=NominalBoard.of(setup).model)
     around = ASIDE * generator.side_m * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     places = (generator.centres[:, None] + around).reshape(-1, 3)
-    wrong = scan_faults([[with_pose(m) for m in own] for own in tools if own], places)
-    _check_alike([s for s in sessions if s.tools], wrong)
-    measurements = [rightly_wired(m, wrong.common) for m in measurements]
+    wrong = scan_faults([with_pose(m) for m in measurements], places)
+    if not wrong:
+        _check_alike(sessions, [[with_pose(m) for m in own] for own in tools], places)
+    measurements = [rightly_wired(m, wrong) for m in measurements]
     names = [Path(session.path).name for session in sessions for _ in session.tools]
     steady = [_steady(session, tool) for session in sessions for tool in session.tools]
     scan = correct_scan(measurements, generator, options, progress, steady)
-    scan = _with_faults(scan, wrong.common)
+    scan = _with_faults(scan, wrong)
     calibration = fit_scan(scan, names, generator, options, progress)
     bare = without_resting_metal(sessions, calibration, progress)
     if bare is not None:
@@ -312,7 +313,7 @@ def _fit_as_scan(
     words = [
         f'{wiring_words(term, sessions[0].sensors, setup.emitter_names)}, says the scan itself, '
         'and the model corrects it: mend the wiring, or what is stated'
-        for term in wrong.common
+        for term in wrong
     ]
     doubts = (*calibration.contradictions, *words)
     return replace(calibration, model=model, scan=scan, contradictions=doubts)
@@ -323,18 +324,18 @@ def _with_readings(setup: Setup, tool: Measurements) -> Measurements:
     return replace(tool, valid=tool.valid & ~unread(setup, tool))
 
 
-def _check_alike(sessions: Sessions, wrong: ScanFaults) -> None:
-    """Raise `FitError` where some sessions are wired or mounted otherwise than the others."""
-    told = dict[str, list[str]]()
-    for number, term in wrong.own:
-        one = sessions[number]
-        words = wiring_words(term, one.sensors, one.setup.emitter_names)
-        told.setdefault(one.path, []).append(words)
-    if told:
-        each = '; '.join(f'{path}: {", ".join(words)}' for path, words in told.items())
+def _check_alike(
+    sessions: Sessions, tools: Sequence[Sequence[Measurements]], places: Array
+) -> None:
+    """Raise `FitError` where a session is wired or mounted otherwise than the others."""
+    there = [k for k, own in enumerate(tools) if any(m.usable.any() for m in own)]
+    number, wrong = session_faults([tools[k] for k in there], places) if there[1:] else (0, [])
+    if wrong:
+        one = sessions[there[number]]
+        words = [wiring_words(term, one.sensors, one.setup.emitter_names) for term in wrong]
         raise FitError(
-            f'{each}, beside the other sessions: mend the poses or the axes that are stated '
-            'there, or the wiring, or leave it out'
+            f'{one.path}: {", ".join(words)}, beside the other sessions: mend the poses or the '
+            'axes that are stated there, or the wiring, or leave it out'
         )
 
 
