@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from tracking_world import NOISE_T, certain_model, fluxes, random_pose, triaxial_tool
 
 from anser_ros.errors import TrackingError
-from anser_ros.field.model import FieldModel
+from anser_ros.field.model import FieldModel, ScanGaps
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.rotations import rotation_of_vector
 from anser_ros.physics.volume import TrackedVolume
@@ -25,6 +25,7 @@ from anser_ros.tracking.solve_context import (
     NOT_FINITE,
     build_context,
     fill_model_errors,
+    growth_at,
     source_spacing,
 )
 from anser_ros.tracking.tracker import Tracker
@@ -246,6 +247,29 @@ def test_dipoles_are_as_far_apart_as_their_nearest_neighbours_elsewhere():
     places = np.array([[0, 0, 0.1], [0, 0, 0.1], [0.03, 0, 0.1], [0.03, 0.05, 0.1], [0.03, 0, 0]])
     np.testing.assert_allclose(source_spacing(places, 0.02), [0.03, 0.03, 0.03, 0.05, 0.0])
     np.testing.assert_allclose(source_spacing(places[:2], 0.02), 0.0)
+
+
+def test_the_error_that_the_field_states_by_place_is_in_sigma_and_misfit(rng):
+    gaps = ScanGaps(np.array([[0.1, 0.0, 0.3]]), np.eye(3)[:1], np.array([[3e-6]]))
+    model, settings = replace(MODEL, gaps=gaps, error_share=1e-3), TrackerSettings(NOISE_T)
+    context, (at, rotation) = build_context(model, settings), random_pose(rng)
+    corner = np.array(settings.box.high)
+    for place in (corner, corner + 0.05):  # beyond the volume it is that of its edge
+        error = model.error_t(np.tile(corner, (1, 3, 1)), np.eye(3)[None], np.zeros(3))
+        expected = 1.0 + np.mean(error**2) / context.sigma[0] ** 2
+        assert expected > 1.01
+        assert growth_at.py_func(place, context.arrays) == pytest.approx(expected, rel=0.02)
+    flux = fluxes(MODEL, TOOL, at, rotation, rng)
+    alike, by_place = (solve(flux, at, rotation, model=m) for m in (ARRAYS, context.arrays))
+    growth = growth_at.py_func(by_place.position, context.arrays)
+    assert growth > 1.5 and by_place.growth == pytest.approx(growth)
+    assert by_place.chi2 == pytest.approx(alike.chi2 / growth, rel=1e-6)
+    np.testing.assert_allclose(by_place.covariance, growth * alike.covariance, rtol=1e-4)
+
+
+def test_a_model_without_an_error_by_place_errs_alike_everywhere():
+    for place in (np.array([0.0, 0.0, 0.1]), np.array([0.1, -0.1, 0.25])):
+        assert growth_at.py_func(place, ARRAYS) == 1.0
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from anser_ros.effects.base import Apparatus, View
 from anser_ros.effects.correction import Fields, reference_view, tool_view
 from anser_ros.effects.effect import Remedy, Term
 from anser_ros.errors import DiagnosisError
-from anser_ros.field.measurements import Measurements, frame_power
+from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import Dipoles, FieldModel
 from anser_ros.parallel import in_order, slices, slices_of
 from anser_ros.physics.dipole import field_basis, flux_basis
@@ -488,15 +488,8 @@ def build_problem(
         tools=posed, blocks=tuple(_numbers(tool.time, edges) for tool in posed),
         references=references, reference_blocks=reference_blocks, fields=fields,
         apparatus=apparatus, spread=spread, good=tuple(tool.valid.copy() for tool in posed),
-        gaps_t=tuple(_gaps_t(tool, model) for tool in posed),
+        gaps_t=tuple(model.error_t(*t.placed(), t.sensors.length) for t in posed),
     )  # fmt: skip
-
-
-def _gaps_t(tool: Measurements, model: FieldModel) -> Array:
-    placed, length, out = tool.placed(), tool.sensors.length, np.zeros(tool.valid.shape)
-    if model.error_share > 0.0:
-        out += model.error_share * np.sqrt(frame_power(model.flux(*placed, length)))[:, None]
-    return out if model.gaps is None else np.hypot(out, model.gaps.sigma_t(*placed, length))
 
 
 def _numbers(time: Array, edges: Array) -> Integers:

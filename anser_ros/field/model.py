@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from anser_ros.arrays import Array, ComplexArray, as_complex, as_real, numbers_of
 from anser_ros.errors import ModelFileError
+from anser_ros.field.measurements import frame_power
 from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.physics.dipole import dipole_field, flux_basis
 from anser_ros.physics.rotations import unturned
@@ -321,14 +322,12 @@ class FieldModel:
     shift_sigma_m: float = 0.0
     # by body, for those whose lever arm is part of that, how they stood then
     open_arms: Mapping[str, OpenArm] = field(default_factory=dict)
-    # by how much the field may be off where the scan has gaps, beyond ``flux_error_t``. Only a
-    # diagnosis reads it; no pose follows from it
+    # by how much the field may be off where the scan has gaps, beyond ``flux_error_t``
     gaps: ScanGaps | None = None
     # noise of a phasor component that the calibration found, with what its fit misses beyond that
     # error, T; 0 if none was
     noise_t: float = 0.0
-    # by which share of a strong flux the field errs beyond ``flux_error_t``, which is typical:
-    # only a diagnosis reads it
+    # by which share of a strong flux the field errs beyond ``flux_error_t``, which is typical
     error_share: float = 0.0
 
     def __post_init__(self) -> None:
@@ -348,7 +347,7 @@ class FieldModel:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Return the model's short name, made of all that poses follow from."""
+        """Return the model's short name, of all that poses follow from but ``error_t``."""
         return fingerprint_of(
             [
                 self.positions, self.directions, self.moments, self.emitters, self.frequencies_hz,
@@ -365,6 +364,17 @@ class FieldModel:
         spans = None if lengths is None else np.broadcast_to(lengths, points.shape[:-1]).ravel()
         flux = self.dipoles.flux(points.reshape(-1, 3), axes.reshape(-1, 3), spans)
         return flux.reshape(*points.shape[:-1], len(self.emitters))
+
+    def error_t(self, points: Array, axes: Array, lengths: Array) -> Array:
+        """Return how far the flux may be off at places beyond ``flux_error_t``, (F, S), T a
+        phasor component. Sensor centres (m) and unit axes (F, S, 3) are in fg, ``lengths`` (S,).
+        """
+        gaps = self.gaps
+        error = np.zeros(points.shape[:2]) if gaps is None else gaps.sigma_t(points, axes, lengths)
+        if self.error_share == 0.0:
+            return error
+        power = frame_power(self.flux(points, axes, lengths))[:, None]
+        return np.asarray(np.hypot(error, self.error_share * np.sqrt(power)))
 
     def __repr__(self) -> str:
         return f'FieldModel({len(self.positions)} dipoles, emitters {", ".join(self.emitters)})'

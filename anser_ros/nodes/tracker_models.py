@@ -116,7 +116,7 @@ class ModelReader:
             raise LayoutError(f'the field model has {count} emitters, the setup {len(names)}')
         kept: dict[str, Any] = {}
         if own is not None:
-            of_own = 'flux_error_t', 'shift_sigma_m', 'open_arms', 'effects'
+            of_own = 'flux_error_t', 'shift_sigma_m', 'open_arms', 'effects', 'gaps', 'error_share'
             kept = {name: getattr(own, name) for name in of_own}
         if error is not None:
             modes = error.modes if len(error.modes) else None

@@ -171,6 +171,11 @@ def _cold_starts(frame: BodyFrame, used: Integers) -> list[Start]:
     return rigid.start_from_grid(context.grid, context.field, coils.subset(used), frame.flux[used])
 
 
+def _misfit(fit: BodyFit) -> float:
+    """Misfit as if errors were alike everywhere: where they are large, anything is explained."""
+    return fit.ratio * fit.solution.growth
+
+
 def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
     """Estimate a body's pose from the fluxes of its usable coils."""
     used, coils, gate = frame.usable, frame.coils, frame.settings.gate
@@ -189,13 +194,13 @@ def track_body(track: BodyTrack, frame: BodyFrame) -> BodyResult:
     continues = bool(fits)
     if not fits:
         fits = [solve_with(frame, used, start) for start in _cold_starts(frame, used)]
-        fits.sort(key=lambda candidate: candidate.ratio)
+        fits.sort(key=_misfit)
         fits[:1] = [_without_disagreeing(f, frame, gate) for f in fits[:1]]
     if not fits:
         reason = 'no coil of this body has a pose to start from'
         return BodyResult(frame, frame.no_pose(states.RESIDUAL, reason))
     fits += _on_other_sides(frame, fits[0])
-    fits.sort(key=lambda candidate: candidate.ratio)
+    fits.sort(key=_misfit)
     fit = fits[0]
     result = _judge(track, frame, fit, fits[1:], continues)
     if result.state == states.OK:
@@ -284,7 +289,7 @@ def _judge(
     by_gain = np.outer(*[solution.gain * solution.carried] * 2)
     position, rotation = solution.position, solution.rotation
     others = (
-        (rival.solution.chi2, 'another pose')
+        (rival.solution.chi2 * rival.solution.growth / solution.growth, 'another pose')
         for rival in rivals
         if rival.solution.converged and _apart(rival.solution, solution)
     )

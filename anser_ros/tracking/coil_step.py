@@ -16,7 +16,7 @@ from anser_ros.stamps import NANO
 from anser_ros.tracking.descent import descend
 from anser_ros.tracking.estimate import TrackerSettings, add_frame, scale_of_frame, sigma_factor
 from anser_ros.tracking.solve import MAX_EVALUATIONS, CoilSolution, coil_covariance
-from anser_ros.tracking.solve_context import fill_model_errors
+from anser_ros.tracking.solve_context import fill_model_errors, growth_at
 from anser_ros.tracking.solve_verdict import IN_METAL, SOUND, Freedom, fault_of, usual_and_most
 
 SUSPICIOUS_JUMP_M = 0.02
@@ -279,6 +279,9 @@ def follow_coils(stamp_ns, values, sound, lengths, memory, model, rules, out):  
             model.columns, model.moments, model.low, model.high, rules.most_steps,
             out.normal[row], out.residual[row], out.found[row],
         )  # fmt: skip
+        growth = growth_at(position, model)
+        out.found[s, 0] /= growth
+        out.normal[s] /= growth
         ratio = out.found[s, 0] / rules.freedom
         is_confirmed = not ratio > rules.gate * rules.gate and out.found[s, 2] != 0.0
         if not is_confirmed or distance(position, memory.good[s]) > SUSPICIOUS_JUMP_M:
@@ -290,7 +293,8 @@ def follow_coils(stamp_ns, values, sound, lengths, memory, model, rules, out):  
             if memory.among[s] > 1.0 and rules.has_gate:  # where it is now, not where expected
                 out.fault[s] = IN_METAL
                 continue
-            remember(s, stamp_ns, position, axis, out.residual[s], ratio, rules.freedom, memory)
+            freedom = rules.freedom * growth
+            remember(s, stamp_ns, position, axis, out.residual[s], ratio, freedom, memory)
     return True
 
 

@@ -20,7 +20,7 @@ from anser_ros.tracking import coil_step
 from anser_ros.tracking.estimate import FRESH_NOISE, PoseEstimate, TrackerSettings
 from anser_ros.tracking.seed import solve_cold
 from anser_ros.tracking.solve import CoilSolution, coil_covariance, solve_coil, whitening_of
-from anser_ros.tracking.solve_context import NOT_FINITE, ErrorModes, SolveContext
+from anser_ros.tracking.solve_context import NOT_FINITE, ErrorModes, SolveContext, growth_at
 from anser_ros.tracking.solve_verdict import SOUND, Freedom, SolveFrame, millimetres
 
 FIRST_RETRY_S, LAST_RETRY_S = 0.05, 0.25
@@ -215,20 +215,29 @@ def _cold(frame: CoilFrame, scans: Scans) -> list[CoilSolution]:
         context.high, frame.length, limit, thorough=scans.failures % THOROUGH_EVERY == 0,
     )  # fmt: skip
     if context.is_certain:
-        return found
+        return [_grown(context, s) for s in found]
     near = [s for s in found if s.chi2 <= 100.0 * limit or s is found[0]]
-    return sorted(
-        (_descend(frame, s.position, s.axis) for s in near), key=lambda solution: solution.chi2
-    )
+    ended = (_descend(frame, s.position, s.axis) for s in near)
+    # as if errors were alike everywhere: a place where they are large explains anything
+    return sorted(ended, key=lambda solution: solution.chi2 * solution.growth)
 
 
 def _descend(frame: CoilFrame, position: Array, axis: Array) -> CoilSolution:
     context, length, row = frame.context, frame.length, frame.row
     _take_errors(frame, position, axis)
-    return solve_coil(
+    solution = solve_coil(
         context.field, frame.flux, frame.tracks.memory.whitening[row], position, axis,
         context.low, context.high, length,
     )  # fmt: skip
+    return _grown(context, solution)
+
+
+def _grown(context: SolveContext, solution: CoilSolution) -> CoilSolution:
+    """Return a solution weighed by the field's error where it ended, not the typical one."""
+    growth = growth_at.py_func(solution.position, context.arrays)
+    return solution._replace(
+        chi2=solution.chi2 / growth, normal=solution.normal / growth, growth=growth
+    )
 
 
 def _take_errors(frame: CoilFrame, position: Array, axis: Array) -> None:
@@ -252,7 +261,7 @@ def _scanned(
         scans.forget()
         coil_step.remember(
             frame.row, frame.stamp_ns, solution.position, solution.axis, solution.residual,
-            judged.chi2, float(frame.freedom.of_residual), frame.tracks.memory,
+            judged.chi2, frame.freedom.of_residual * solution.growth, frame.tracks.memory,
         )  # fmt: skip
     else:
         wait_s = min(FIRST_RETRY_S * 2.0 ** min(scans.failures, 10), LAST_RETRY_S)
@@ -266,7 +275,7 @@ def _judge(
 ) -> PoseEstimate:
     position, axis, settings = solution.position, solution.axis, frame.settings
     others = (
-        (rival.chi2, f'{millimetres(rival.position)} mm')
+        (rival.chi2 * rival.growth / solution.growth, f'{millimetres(rival.position)} mm')
         for rival in rivals
         if rival.converged and settings.box.contains(rival.position)
     )

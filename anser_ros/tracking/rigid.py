@@ -36,7 +36,7 @@ from anser_ros.tracking.solve import (
     RealField,
     bounded_inverse,
 )
-from anser_ros.tracking.solve_context import NOT_FINITE, ModelArrays
+from anser_ros.tracking.solve_context import NOT_FINITE, ModelArrays, growth_at
 
 
 @inlined
@@ -307,6 +307,7 @@ class BodySolution(NamedTuple):
     # What a gain of all coils may be off by, and what a gain does to the pose (6,), m and rad
     gain: float
     carried: Array
+    growth: float  # variance that is expected there over the typical one
 
 
 @kernel
@@ -421,10 +422,12 @@ def solve_near(position, rotation, coils, flux, model):  # type: ignore[no-untyp
         position.copy(), rotation.copy(), offsets, axes, lengths, flux, 1.0 / model.sigma, common,
         model.columns, model.moments, model.low - reach, model.high + reach, budget,
     )  # fmt: skip
+    growth = growth_at(place, model)
+    chi2, information, white = chi2 / growth, information / growth, white / math.sqrt(growth)
     coil_chi2, whitened, covariance, gain, carried = weigh(white, common, information, count)
     return is_finite, BodySolution(
         place, turn, chi2, information, residual, converged, white, coil_chi2, whitened,
-        covariance, gain, carried,
+        covariance, gain, carried, growth,
     )  # fmt: skip
 
 

@@ -72,6 +72,8 @@ class CoilSolution(NamedTuple):
     residual: Array  # (2K,), measured minus modelled flux, T; real and imaginary part by turns
     evaluations: int  # Field evaluations used
     converged: bool  # Whether the last step was negligible
+    # Variance that is expected there over the typical one, by which the above are weighed
+    growth: float = 1.0
 
 
 def whitening_of(sigma: Array) -> Array:

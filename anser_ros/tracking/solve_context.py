@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
-from anser_ros.field.model import FieldModel, SymmetryAxis, symmetry_axis
-from anser_ros.kernel_cache import kernel
+from anser_ros.field.model import FieldModel, ScanGaps, SymmetryAxis, symmetry_axis
+from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.dipole import fill_flux_basis, flux_basis
 from anser_ros.physics.sensor import along_each_axis
 from anser_ros.physics.volume import TrackedVolume
@@ -185,6 +185,48 @@ class Starts:
         return self._made[0]
 
 
+PLACES = 9
+"""Places along each side of the volume at which the field's error is looked up; its logarithm is
+interpolated. Over 0.3 m they are 4 cm apart: a scan's gaps are as wide."""
+NO_ERROR = -200.0
+"""Logarithm of a variance, T^2, that adds nothing to any noise."""
+
+
+class PlacedErrors(NamedTuple):
+    """Holds by how much a flux component may be off at places, beyond what is typical."""
+
+    log: Array  # (PLACES^3,), logarithm of the variance, T^2, at places of a grid, z fastest
+    low: Array  # (3,), where the grid begins, m
+    step: Array  # (3,), m
+
+    @classmethod
+    def of(cls, model: FieldModel, box: TrackedVolume) -> 'PlacedErrors':
+        """Work out what a model states of its errors in a volume."""
+        low, step = np.array(box.low), np.subtract(box.high, box.low) / (PLACES - 1)
+        places = low + step * np.indices((PLACES,) * 3).reshape(3, -1).T
+        at, axes = (some.reshape(-1, 3, 3) for some in along_each_axis(places))
+        variance = (model.error_t(at, axes, np.zeros(3)) ** 2).mean(axis=1)
+        return cls(np.log(np.maximum(variance, math.exp(NO_ERROR))), low, step)
+
+
+@inlined
+def growth_at(place, model):  # type: ignore[no-untyped-def]
+    """Return by which factor a flux component's variance at a place (3,), m, is larger than it
+    typically is. ``model`` is `SolveContext.arrays`.
+    """
+    log, low, step = model.errors
+    total = 0.0
+    for corner in range(8):
+        index, weight = 0, 1.0
+        for i in range(3):
+            at = min(max((place[i] - low[i]) / step[i], 0.0), PLACES - 1.001)
+            side, cell = (corner >> i) & 1, int(at)
+            index = PLACES * index + cell + side
+            weight *= at - cell if side else 1.0 - at + cell
+        total += weight * log[index]
+    return 1.0 + math.exp(total) / model.sigma[0] ** 2
+
+
 @dataclass(frozen=True)
 class ErrorModes:
     """Lays a model's uncertainty out for one product with sensors' coupling to its dipoles."""
@@ -245,6 +287,7 @@ class ModelArrays(NamedTuple):
     low: Array
     high: Array
     share: float
+    errors: PlacedErrors
 
 
 AS_THEY_ARE: Array = np.empty((0, 0))
@@ -271,6 +314,10 @@ class SolveContext:
     # (2K, Q), relative errors of the emitters' strengths, of one standard deviation each, real and
     # imaginary part by turns; (0, 0) where these are the model's
     strengths: Array
+    errors: PlacedErrors
+    # what the map was made from, besides the field
+    gaps: ScanGaps | None
+    errors_of: tuple[object, ...]
 
     @property
     def is_certain(self) -> bool:
@@ -333,7 +380,7 @@ class SolveContext:
             moments = modes.moments
         return ModelArrays(
             columns, self.field.moments, self.sigma, uncertain, spacing, moments, self.strengths,
-            self.low, self.high, self.model_share,
+            self.low, self.high, self.model_share, self.errors,
         )  # fmt: skip
 
     def make_ready(self) -> None:
@@ -381,7 +428,15 @@ def build_context(
     else:
         starts = previous.starts.following()
     share = 1.0 - settings.flux_noise_t**2 / variance
-    return SolveContext(field, sigma, modes, starts, low, high, name, share, AS_THEY_ARE)
+    known, errors_of = previous, (model.error_share, settings.box)
+    if known is None or known.gaps is not model.gaps or known.errors_of != errors_of:
+        errors = PlacedErrors.of(model, settings.box)
+    else:
+        errors = known.errors
+    return SolveContext(
+        field, sigma, modes, starts, low, high, name, share, AS_THEY_ARE, errors, model.gaps,
+        errors_of,
+    )  # fmt: skip
 
 
 FEWEST_EMITTERS = 6
