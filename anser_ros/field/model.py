@@ -217,7 +217,7 @@ def parse_readings(document: Any, emitters: int) -> ReferenceReadings:
     return ReferenceReadings(names, rows[:, :3].copy(), rows[:, 3:6].copy(), flux, sigma)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ScanGaps:
     """Holds what a scan leaves open of the field, alike for all emitters."""
 

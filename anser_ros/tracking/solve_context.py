@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from anser_ros.arrays import Array, Booleans, ComplexArray, Integers
-from anser_ros.field.model import FieldModel, ScanGaps, SymmetryAxis, symmetry_axis
+from anser_ros.field.model import FieldModel, SymmetryAxis, symmetry_axis
 from anser_ros.kernel_cache import inlined, kernel
 from anser_ros.physics.dipole import fill_flux_basis, flux_basis
 from anser_ros.physics.sensor import along_each_axis
@@ -315,9 +315,7 @@ class SolveContext:
     # imaginary part by turns; (0, 0) where these are the model's
     strengths: Array
     errors: PlacedErrors
-    # what the map was made from, besides the field
-    gaps: ScanGaps | None
-    errors_of: tuple[object, ...]
+    errors_of: tuple[object, ...]  # what these were made from, besides the field
 
     @property
     def is_certain(self) -> bool:
@@ -428,15 +426,14 @@ def build_context(
     else:
         starts = previous.starts.following()
     share = 1.0 - settings.flux_noise_t**2 / variance
-    known, errors_of = previous, (model.error_share, settings.box)
-    if known is None or known.gaps is not model.gaps or known.errors_of != errors_of:
-        errors = PlacedErrors.of(model, settings.box)
+    errors_of = model.gaps, model.error_share, settings.box
+    if previous is not None and previous.errors_of == errors_of:
+        errors = previous.errors
     else:
-        errors = known.errors
+        errors = PlacedErrors.of(model, settings.box)
     return SolveContext(
-        field, sigma, modes, starts, low, high, name, share, AS_THEY_ARE, errors, model.gaps,
-        errors_of,
-    )  # fmt: skip
+        field, sigma, modes, starts, low, high, name, share, AS_THEY_ARE, errors, errors_of
+    )
 
 
 FEWEST_EMITTERS = 6
