@@ -258,8 +258,11 @@ def test_a_reversed_sensor_of_a_scan_is_used_and_what_no_field_explains_refused(
     name = tool.sensors.name[1]
     assert [f'sensor {name} is reversed' in w for w in found.contradictions] == [True]
     other = replace(wrong, path='other.mcap')
-    with pytest.raises(FitError, match=f'^other.mcap: sensor {name} is reversed, beside the'):
+    unlike = f'^other.mcap: unlike in the other sessions, sensor {name} is reversed'
+    with pytest.raises(FitError, match=unlike):
         calibrate_sessions([factory, replace(factory, path='again'), other], options)
+    with pytest.raises(FitError, match=f'other.mcap contradict .* one of them, sensor {name} is'):
+        calibrate_sessions([factory, other], options)
     unread = np.where(np.arange(len(tool.sensors))[:, None] == 1, 1e-11, tool.flux)
     calibrate_sessions([replace(factory, tools=(replace(tool, flux=unread),))], options)
     exact = factory.with_stated({'optical_position_m': 1e-6})

@@ -311,8 +311,8 @@ def _fit_as_scan(
     scan = replace(scan, reported_effects=(*scan.reported_effects, *drifts))
     model = at_start(calibration.model) if drifts else calibration.model
     words = [
-        f'{wiring_words(term, sessions[0].sensors, setup.emitter_names)}, says the scan itself, '
-        'and the model corrects it: mend the wiring, or what is stated'
+        f'{wiring_words(term, sessions[0].sensors, setup.emitter_names)}, according to the scan '
+        'itself, and the model corrects it: correct the wiring, or what is stated'
         for term in wrong
     ]
     doubts = (*calibration.contradictions, *words)
@@ -331,12 +331,12 @@ def _check_alike(
     there = [k for k, own in enumerate(tools) if any(m.usable.any() for m in own)]
     number, wrong = session_faults([tools[k] for k in there], places) if there[1:] else (0, [])
     if wrong:
-        one = sessions[there[number]]
-        words = [wiring_words(term, one.sensors, one.setup.emitter_names) for term in wrong]
-        raise FitError(
-            f'{one.path}: {", ".join(words)}, beside the other sessions: mend the poses or the '
-            'axes that are stated there, or the wiring, or leave it out'
-        )
+        one, two = sessions[there[number]], [str(sessions[k].path) for k in there]
+        told = ', '.join(wiring_words(t, one.sensors, one.setup.emitter_names) for t in wrong)
+        which = f'{one.path}: unlike in the other sessions, {told}'
+        if not two[2:]:  # neither is known to be right
+            which = f'{" and ".join(two)} contradict each other: in one of them, {told}'
+        raise FitError(f'{which}. Correct its poses, stated axes or wiring, or omit it')
 
 
 def _with_faults(scan: Scan, faults: Sequence[Term]) -> Scan:

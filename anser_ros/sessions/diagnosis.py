@@ -89,7 +89,8 @@ def diagnose_session(
     share, quadrature = power_left(some, plugs)
     if power_left(mirrored.thinned(WIRING_FRAMES), plugs)[1] < BETTER * quadrature:
         raise PlausibilityError(
-            f"{session.path}: all phases are the model's reversed: imaginary parts of other sign?"
+            f"{session.path}: all phases are opposite to the model's: "
+            'have imaginary parts the other sign?'
         )
     is_near = bool(plugs) or share < NEAR
     gross = [] if is_near else [one for one in track(prepared).disagreements if one.is_gross]
