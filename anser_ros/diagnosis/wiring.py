@@ -107,11 +107,17 @@ def without_dead(problem: Problem) -> Problem:
     return replace(problem, good=tuple(good))
 
 
-def power_left(problem: Problem, known: Sequence[Term]) -> tuple[float, float]:
-    """Return the share of power that predictions leave of a tool, and of imaginary parts, T^2."""
+def power_left(problem: Problem, known: Sequence[Term]) -> tuple[float, float, float]:
+    """Return what predictions leave: the share of a tool's power, and of all tools, T^2, the
+    real and the imaginary parts.
+    """
     tools = _read(problem, known)
-    quadrature = sum(float(_power((t.seen - t.wanted).imag)) for t in tools)
-    return max(t.left() for t in tools), quadrature
+    left = [t.seen - t.wanted for t in tools]
+    in_phase, quadrature = (
+        sum(float(_power(part)) for part in parts)
+        for parts in ([one.real for one in left], [one.imag for one in left])
+    )
+    return max(t.left() for t in tools), in_phase, quadrature
 
 
 def common_gain(problem: Problem) -> float | None:

@@ -86,8 +86,10 @@ def diagnose_session(
     plugs = wiring_faults(some)
     tools = tuple(replace(tool, flux=tool.flux.conj()) for tool in session.tools)
     mirrored = problem_of(correct(prepared.with_session(replace(session, tools=tools))))
-    share, quadrature = power_left(some, plugs)
-    if power_left(mirrored.thinned(WIRING_FRAMES), plugs)[1] < BETTER * quadrature:
+    share, in_phase, quadrature = power_left(some, plugs)
+    *_, otherwise = power_left(mirrored.thinned(WIRING_FRAMES), plugs)
+    # Exchanged channels leave their delays, too, which are little beside what they leave in phase.
+    if otherwise < BETTER * quadrature and quadrature > BETTER * in_phase:
         raise PlausibilityError(
             f"{session.path}: all phases are opposite to the model's: "
             'have imaginary parts the other sign?'
