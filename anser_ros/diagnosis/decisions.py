@@ -94,15 +94,15 @@ got a loose axis that explains 0.015 (`docs/log.md`)."""
 REMNANT = 0.01
 """Further metal with less than this share of the strongest metal's gain is what the model of that
 one left."""
+OWN_METAL = 2.0
+"""Gain of metal at rest, over the power that the model states of its own error, everywhere and by
+place, in all readings, below which it may be the model's: what was taken off a scan with metal
+near leaves a field that is metal's, 1.1 times that power in `dirty/scan_metal`, the only one
+tried. Larger hides faint metal (what moves a tool by 0.03 mm)."""
 OWN_SHARE = 0.5
 """The same for any other effect. What a model misses has many shapes, of which one effect is part:
 at most 0.42 of what the model stated, in 27 good recordings of a real tracker. Smaller names such
 a part; larger misses what changed by less than the model states to be wrong by."""
-OWN_METAL = 2.0
-"""Gain of metal at rest, over the power that the model states of its own error, everywhere and by
-place, in all readings, below which it may be the model's: what was taken
-off a scan with metal near leaves a field that is metal's, 1.1 times that power in
-`dirty/scan_metal`, the only one tried. Larger hides faint metal (what moves a tool by 0.03 mm)."""
 COMPLETE = 3.0
 """Misfit up to which parts that were set up anew explain a session, so that they are its rival to
 metal at rest. They have so many parameters that beside another effect they take off much of what
@@ -187,8 +187,8 @@ LARGEST_VARIATION = 0.1
 of the data may take off besides. What is truly there varies by what its model is wrong by
 (`Effect.inexact`: 1 % for most), and by chance: normal noise alone lets the refits of six parts of
 the time take off some 3 with one parameter each and 8 with six, which is a share only of an effect
-of little power. Larger confirms what stands in
-for another effect; smaller refuses effects whose model is only near the truth, as metal's is."""
+of little power. Larger confirms what stands in for another effect; smaller refuses effects whose
+model is only near the truth, as metal's is."""
 LEAST_OF_THE_REST = 0.2
 """An effect that takes off less than this share of what stays unexplained is not named: something
 larger is unknown, and the effect is probably its trace."""

@@ -331,11 +331,11 @@ def _check_alike(
     there = [k for k, own in enumerate(tools) if any(m.usable.any() for m in own)]
     number, wrong = session_faults([tools[k] for k in there], places) if there[1:] else (0, [])
     if wrong:
-        one, two = sessions[there[number]], [str(sessions[k].path) for k in there]
+        one, paths = sessions[there[number]], [str(sessions[k].path) for k in there]
         told = ', '.join(wiring_words(t, one.sensors, one.setup.emitter_names) for t in wrong)
         which = f'{one.path}: unlike in the other sessions, {told}'
-        if not two[2:]:  # neither is known to be right
-            which = f'{" and ".join(two)} contradict each other: in one of them, {told}'
+        if not paths[2:]:  # neither is known to be right
+            which = f'{" and ".join(paths)} contradict each other: in one of them, {told}'
         raise FitError(f'{which}. Correct its poses, stated axes or wiring, or omit it')
 
 
